@@ -24,8 +24,7 @@ from symphony.data.convert import convert
 from symphony.data.segment import RunSegment, content_hash, validate
 from symphony.data.sources import get_reader, readers
 from symphony.data.sources.base import Item
-from symphony.data.sources.commonroad import NO_OBSTACLE
-from symphony.data.sources.commonroad_map import NO_LANELET, NO_LIGHT
+from symphony.data.sources.commonroad import NO_LANELET, NO_LIGHT, NO_OBSTACLE
 from symphony.data.sources.tfrecord import write_records
 from symphony.errors import DataError
 
@@ -184,7 +183,7 @@ NO_DRIVERS = commonroad(ROAD, obstacle(7, [state(0, 0, 0)], role="static"))
         (LANELESS, "lanelet", "has no lanes"),
         (NO_DRIVERS, "dynamicObstacle", "has no dynamic obstacles"),
         (commonroad(ROAD, driver(7, speed=0)), "dynamicObstacle", "no moving vehicle"),
-        (GOOD.replace("2020a", "2017a"), "commonRoadVersion", "2018b, 2020a"),
+        (GOOD.replace("2020a", "2017a"), "commonRoadVersion", "2018b or 2020a"),
         (GOOD.replace('timeStepSize="0.1"', ""), "timeStepSize", "not a number"),
         (GOOD.replace('timeStepSize="0.1"', 'timeStepSize="nan"'), "timeStepSize", "not finite"),
         (GOOD.replace("<exact>3</exact>", "<exact>90000</exact>", 1), "time", "at most"),
@@ -209,14 +208,14 @@ def test_commonroad_errors_name_segment_and_field(
 @pytest.mark.parametrize(
     ("old", "new", "kind", "example"),
     [
-        ("<exact>3</exact>", "<exact>2</exact>", NO_OBSTACLE, "obstacle 7: time: two states at step 2"),
+        ("<exact>3</exact>", "<exact>2</exact>", NO_OBSTACLE, "obstacle 7: time: two states at step"),
         ("<x>1.0</x>", "<x>NaN</x>", NO_OBSTACLE, "obstacle 7: position: nan is not finite"),
         ("<velocity><exact>10.0", "<velocity><exact>fast", NO_OBSTACLE, "obstacle 7: velocity: 'fast'"),
-        (RECTANGLE, "", NO_OBSTACLE, "obstacle 7: shape: no rectangle"),
+        (RECTANGLE, "", NO_OBSTACLE, "obstacle 7: shape: expected one rectangle"),
         ('Obstacle id="7"', 'Obstacle id="99999999999999999999"', NO_OBSTACLE, "64 bits"),
-        ("<x>25</x>", "<x>inf</x>", NO_LANELET, "lanelet 10: leftBound: inf is not finite"),
+        ("<x>25</x>", "<x>inf</x>", NO_LANELET, "lanelet 10: bound: inf is not finite"),
         ('ref="11"', 'ref="next"', NO_LANELET, "lanelet 10: successor: 'next' is not an integer"),
-        ("<color>red", "<color>pink", NO_LIGHT, "trafficLight 30: color: unknown color 'pink'"),
+        ("<color>red", "<color>pink", NO_LIGHT, "trafficLight 30: color: unknown colors ['pink']"),
         ("<duration>3</duration>", "", NO_LIGHT, "trafficLight 30: duration"),
     ],
 )

@@ -1,24 +1,33 @@
+"""The CommonRoad reader: obstacles, egos, lanelet networks and traffic lights."""
+
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from helpers_sources import (
     RECTANGLE,
     ROAD,
+    bound,
     commonroad,
     driver,
     lanelet,
     obstacle,
     off_road,
     read_one,
+    signed_area,
     state,
 )
 from helpers_sources import convert_xml as convert
-from symphony.data.segment import RunSegment, content_hash
+from symphony.data.segment import MarkType, RunSegment, SignalState, content_hash
 from symphony.data.sources import get_reader
+from symphony.data.sources.commonroad import NO_OBSTACLE
+from symphony.data.sources.lines import SLIT, drivable_rings
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 
@@ -34,17 +43,12 @@ def path(tmp_path: Path) -> Path:
 def test_tracks(path: Path, version: str) -> None:
     late = driver(8, version, 10.0, -0.5, 8.0, range(2, 4))
     segment = convert(path, ROAD, driver(7, version, 3.3, 0.4), late, version=version)
-    assert (segment.segment_id, segment.source, segment.file) == (
-        "ZAM_Made-1_1_T-1",
-        "commonroad",
-        "made.xml",
-    )
+    assert (segment.segment_id, segment.file) == ("ZAM_Made-1_1_T-1", "made.xml")
     assert (segment.dt, segment.num_steps, segment.ego, segment.current_step) == (0.1, 5, 0, 0)
     np.testing.assert_array_equal(segment.agent_id, [7, 8])
     np.testing.assert_array_equal(segment.valid, [[1] * 5, [0, 0, 1, 1, 0]])
     np.testing.assert_array_equal(segment.origin, [3, 0, 0])
     np.testing.assert_allclose(segment.position[0, :, 0], 0.3 + np.arange(5), atol=1e-5)
-    np.testing.assert_allclose(segment.position[0, :, 1], 0.4, atol=1e-6)
     np.testing.assert_allclose(segment.position[1, 2:4, :2], [[8.6, -0.5], [9.4, -0.5]], atol=1e-5)
     np.testing.assert_allclose(segment.velocity[0], [[10, 0]] * 5)
     np.testing.assert_array_equal(segment.size, np.float32([[4.5, 2, 0]] * 2))
@@ -79,20 +83,18 @@ def test_a_missing_velocity_is_the_slope_of_the_positions(path: Path) -> None:
     assert not convert(path, ROAD, driver(7), single).velocity[1].any()
 
 
-def test_intervals_and_regions_become_their_middle(path: Path) -> None:
-    def between(tag: str, low: float, high: float) -> str:
-        return f"<{tag}><intervalStart>{low}</intervalStart><intervalEnd>{high}</intervalEnd></{tag}>"
-
-    box = "<rectangle><length>2</length><width>1</width><center><x>30</x><y>1</y></center></rectangle>"
-    vague = (
-        f"<state><position>{box}</position>{between('orientation', 0.2, 0.4)}{between('time', 1, 3)}"
-        f"{between('velocity', 4, 6)}</state>"
+def test_predicted_states_are_no_log(path: Path) -> None:
+    vague = state(1, 30, 1).replace(
+        "<exact>1</exact>", "<intervalStart>1</intervalStart><intervalEnd>3</intervalEnd>"
     )
-    segment = convert(path, ROAD, driver(7), obstacle(8, [vague]))
-    assert np.flatnonzero(segment.valid[1]).tolist() == [2]
-    np.testing.assert_allclose(segment.position[1, 2], [30, 1, 0], atol=1e-5)
-    np.testing.assert_allclose(segment.heading[1, 2], 0.3, rtol=1e-6)
-    np.testing.assert_allclose(np.hypot(*segment.velocity[1, 2]), 5, rtol=1e-6)
+    assert list(convert(path, ROAD, driver(7), obstacle(8, [vague])).odd) == [NO_OBSTACLE]
+
+
+POLYGON = "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in [(0, 0), (3, 0), (3, 1), (0, 1)])
+TURNED = (
+    "<rectangle><length>4</length><width>2</width><orientation>0.5</orientation>"
+    "<center><x>1</x><y>0.2</y></center></rectangle>"
+)
 
 
 @pytest.mark.parametrize(
@@ -100,22 +102,8 @@ def test_intervals_and_regions_become_their_middle(path: Path) -> None:
     [
         (RECTANGLE, (4.5, 2), (0, 0), 0),
         ("<circle><radius>0.4</radius></circle>", (0.8, 0.8), (0, 0), 0),
-        (
-            "<polygon>"
-            + "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in [(0, 0), (3, 0), (3, 1), (0, 1)])
-            + "</polygon>",
-            (3, 1),
-            (1.5, 0.5),
-            0,
-        ),
-        (
-            "<rectangle><length>4</length><width>2</width><orientation>0.5</orientation>"
-            "<center><x>1</x><y>0.2</y></center></rectangle>",
-            (4, 2),
-            (1, 0.2),
-            0.5,
-        ),
-        (RECTANGLE + "<circle><radius>1.5</radius></circle>", (4.5, 3), (0, 0), 0),
+        (f"<polygon>{POLYGON}</polygon>", (3, 1), (1.5, 0.5), 0),
+        (TURNED, (4, 2), (1, 0.2), 0.5),
     ],
 )
 def test_boxes_bound_their_shape(
@@ -154,18 +142,88 @@ def test_the_ego_has_the_most_moving_neighbours(path: Path) -> None:
 
 def test_all_egos_differ_only_by_ego_and_name(path: Path, tmp_path: Path) -> None:
     path.write_text(commonroad(ROAD, driver(7), driver(8, x=30)))
-    one = read_one("commonroad", path)
-    first, second = get_reader("commonroad", egos="all").read(path)
-    assert isinstance(first, RunSegment)
-    assert isinstance(second, RunSegment)
-    assert (first.agent_id[first.ego], second.agent_id[second.ego]) == (7, 8)
-    same = {content_hash(each.replace(ego=0, segment_id="")) for each in (one, first, second)}
-    assert len(same) == 1
-    assert {each.group for each in (one, first, second)} == {"ZAM_Made-1_1_T-1"}
+    found = [read_one("commonroad", path), *get_reader("commonroad", egos="all").read(path)]
+    segments = [each for each in found if isinstance(each, RunSegment)]
+    assert [each.agent_id[each.ego] for each in segments] == [7, 7, 8]
+    assert len({content_hash(each.replace(ego=0, segment_id="")) for each in segments}) == 1
+    assert {each.group for each in segments} == {"ZAM_Made-1_1_T-1"}
     with StoreWriter(tmp_path / "store") as writer:
-        for each in (first, second):
+        for each in segments[1:]:
             writer.append(each)
     assert SegmentStore(tmp_path / "store").num_maps == 1
+
+
+# Lanelets
+
+
+def test_lanes(path: Path) -> None:
+    near = lanelet(12, [(0, 6), (50, 6)], [(0, 2), (50, 2)], '<adjacentRight ref="10" drivingDir="same"/>')
+    opposite = '<adjacentLeft ref="10" drivingDir="opposite"/>'
+    against = lanelet(13, [(50, -2), (0, -2)], [(50, -6), (0, -6)], opposite)
+    main = lanelet(
+        10,
+        [(0, 2), (50, 2)],
+        [(0, -2), (20, -2), (50, -2)],
+        '<successor ref="11"/><successor ref="99"/><adjacentLeft ref="12" drivingDir="same"/>'
+        '<adjacentRight ref="13" drivingDir="opposite"/>',
+    )
+    after = lanelet(11, [(50, 2), (100, 2)], [(50, -2), (100, -1)], '<predecessor ref="10"/>')
+    road = convert(path, driver(7), main, after, near, against).road
+    assert road.lane_id.tolist() == [10, 11, 12, 13]
+    links = [each.tolist() for each in (road.successors, road.left_neighbors, road.right_neighbors)]
+    assert links == [[[0, 1]], [[0, 2]], [[2, 0]]]
+    np.testing.assert_allclose(road.lane_width, [4, 3.5, 4, 4], rtol=1e-6)
+    np.testing.assert_allclose(road.lanes[0][:, :2], [[0, 0], [25, 0], [50, 0]], atol=1e-6)
+    np.testing.assert_allclose(road.lanes[3][:, :2], [[50, -4], [0, -4]], atol=1e-6)
+
+
+def test_speed_limits_of_either_version(path: Path) -> None:
+    ends = [(50, 2), (100, 2)], [(50, -2), (100, -2)]
+    sign = (
+        '<trafficSign id="5"><trafficSignElement><trafficSignID>{}</trafficSignID>'
+        "<additionalValue>13.5</additionalValue></trafficSignElement></trafficSign>"
+    )
+    old = lanelet(11, *ends, "<speedLimit>12.5</speedLimit>")
+    assert convert(path, driver(7, "2018b"), old, version="2018b").road.speed_limit.tolist() == [12.5]
+    lane = lanelet(11, *ends, '<trafficSignRef ref="5"/><trafficSignRef ref="77"/>')
+    for kind, expected in (("274", 13.5), ("R2-1", 13.5), ("206", np.nan)):
+        found = convert(path, driver(7), lane, sign.format(kind)).road.speed_limit
+        np.testing.assert_array_equal(found, np.float32([expected]))
+
+
+def test_walkways_are_no_lanes(path: Path) -> None:
+    walk = lanelet(20, [(0, 4), (50, 4)], [(0, 2), (50, 2)], "<laneletType>sidewalk</laneletType>")
+    cross = lanelet(21, [(20, 2), (20, -2)], [(18, 2), (18, -2)], "<laneletType>crosswalk</laneletType>")
+    road = convert(path, ROAD, walk, cross, driver(7)).road
+    assert (road.lane_id.tolist(), road.mark_type.tolist()) == ([10, 11], [MarkType.CROSSWALK])
+    assert road.boundary.points[:, 1].max() == 2
+
+
+@pytest.mark.parametrize("kind", ["shoulder", "border", "parking", "restricted"])
+def test_what_lies_beside_the_lanes_is_road_and_no_lane(path: Path, kind: str) -> None:
+    """Nobody's route leads along it, nobody who stands there is off the road, and it is cut where the lanes are."""
+    types = f"<laneletType>urban</laneletType><laneletType>{kind}</laneletType>"
+    more = '<adjacentLeft ref="10" drivingDir="same"/>'
+    strips = [
+        lanelet(20, [(0, -2), (50, -2)], [(0, -4), (50, -4)], f'{types}<successor ref="21"/>{more}'),
+        lanelet(21, [(50, -2), (100, -2)], [(50, -4), (100, -4)], types),
+    ]
+    segment, plain = (convert(path, ROAD, *beside, driver(7)) for beside in (strips, []))
+    for name in ("lane_id", "successors", "left_neighbors", "right_neighbors", "lane_type"):
+        np.testing.assert_array_equal(getattr(segment.road, name), getattr(plain.road, name))
+    spots = np.array([(50, 0), (50, -3), (99, -3.9), (150, -3), (50, -4.5), (50, 2.5)]) - segment.origin[:2]
+    assert (off_road(segment.road, spots) > 0).tolist() == [False] * 4 + [True] * 2
+    with pytest.raises(AssertionError, match="field lanelet: has no lanes"):
+        convert(path, *strips, driver(7))
+
+
+def test_painted_lines_are_marks_and_shared_ones_count_once(path: Path) -> None:
+    middle = [(0, 2), (50, 2)]
+    low = bound("left", middle, "dashed") + bound("right", [(0, -2), (50, -2)], "no_marking")
+    high = bound("left", [(0, 6), (50, 6)], "solid") + bound("right", middle, "dashed")
+    road = convert(path, f'<lanelet id="1">{low}</lanelet><lanelet id="2">{high}</lanelet>', driver(7)).road
+    assert road.mark_type.tolist() == [MarkType.ROAD_LINE] * 2
+    assert sorted(road.marks.points[:, 1].tolist()) == [2, 2, 6, 6]
 
 
 def test_the_boundary_is_open_where_the_network_is_cut(path: Path) -> None:
@@ -173,12 +231,12 @@ def test_the_boundary_is_open_where_the_network_is_cut(path: Path) -> None:
     turn = lanelet(12, [(100, 2), (120, 2)], [(100, -2), (120, -2)], '<predecessor ref="11"/>')
     for road, end in ((ROAD, 100), (ROAD + turn, 120)):
         segment = convert(path, road, driver(7))
-        spots = np.array(
-            [(50, 0), (end + 9, 0), (end + 30, 1), (-9, -1), (50, 3), (end - 1, 3), (end + 9, 9)]
+        inside, outside = (
+            [(50, 0), (end + 9, 0), (end + 30, 1), (-9, -1)],
+            [(50, 3), (end - 1, 3), (end + 9, 9)],
         )
-        away = off_road(segment.road, spots - segment.origin[:2])
-        assert (away[:4] < 0).all()
-        assert (away[4:] > 0).all()
+        away = off_road(segment.road, np.array(inside + outside) - segment.origin[:2])
+        assert (away > 0).tolist() == [False] * 4 + [True] * 3
         lines = [segment.road.boundary[k] + segment.origin for k in range(len(segment.road.boundary))]
         assert len(lines) == 2
         # Each runs along one side, drivable side on the left.
@@ -187,4 +245,87 @@ def test_the_boundary_is_open_where_the_network_is_cut(path: Path) -> None:
             assert np.sign(np.diff(line[:, 0])).tolist() == [-np.sign(line[0, 1])] * (len(line) - 1)
 
 
-# Real files.
+def test_boundary_rings_have_the_drivable_side_on_their_left(path: Path) -> None:
+    corners = [(-20, -20), (20, -20), (20, 20), (-20, 20), (-20, -20)]
+    inner = [(0.8 * x, 0.8 * y) for x, y in corners]
+    after = [f'<successor ref="{(k + 1) % 4}"/>' for k in range(4)]
+    square = [lanelet(k, inner[k : k + 2], corners[k : k + 2], after[k]) for k in range(4)]
+    boundary = convert(path, *square, driver(7, y=-18)).road.boundary
+    areas = sorted(signed_area(boundary[k].astype(float)) for k in range(len(boundary)))
+    np.testing.assert_allclose(areas, [-(32.0**2), 40.0**2], rtol=1e-4)
+
+
+TINY = 4.139035625378231e-209
+"""On the way shapely divides by what is not quite zero."""
+BOX = st.tuples(*(st.floats(a, b) for a, b in ((-50, 50), (-50, 50), (0.1, 20), (1, 20), (0, 6.3))))
+
+
+@settings(max_examples=40, deadline=None)
+@example(
+    [
+        (0, 0, 1, 1, 0),
+        (0, 0, 1, 1, 1),
+        (0, 0, 1, 1, 1),
+        (0, 0, 2, 1, TINY),
+        (0, TINY, 3, 1, 0),
+        (2, 0, 1, 1, 2),
+    ]
+)
+@given(st.lists(BOX, min_size=1, max_size=6))
+def test_rings_bound_the_union(boxes: list[tuple[float, ...]]) -> None:
+    outlines = []
+    for x, y, length, width, angle in boxes:
+        corners = np.array([[0, 0], [length, 0], [length, width], [0, width], [0, 0]])
+        c, s = np.cos(angle), np.sin(angle)
+        outlines.append(corners @ np.array([[c, s], [-s, c]]) + [x, y])
+    rings = drivable_rings(outlines)
+    area = sum(signed_area(ring) for ring in rings)
+    with np.errstate(all="ignore"):
+        union = shapely.union_all([shapely.Polygon(outline) for outline in outlines])
+    assert union.area - 0.5 <= area <= union.buffer(2 * SLIT).area + 0.5
+    shells = [shapely.Polygon(ring) for ring in rings if signed_area(ring) > 0]
+    holes = [shapely.Polygon(ring) for ring in rings if signed_area(ring) < 0]
+    rebuilt = shapely.union_all(shells).difference(shapely.union_all(holes))
+    assert union.difference(rebuilt.buffer(0.05)).area < 0.05
+
+
+# Lights
+
+CYCLE = "".join(
+    f"<cycleElement><duration>{steps}</duration><color>{color}</color></cycleElement>"
+    for steps, color in ((3, "green"), (1, "yellow"), (4, "red"))
+)
+APPROACH = '<successor ref="11"/><successor ref="12"/><trafficLightRef ref="30"/>'
+FORK = lanelet(10, [(0, 2), (50, 2)], [(0, -2), (50, -2)], APPROACH)
+FORK += "".join(
+    lanelet(target, [(50, 2), (100, 2 + dy)], [(50, -2), (100, -2 + dy)])
+    for target, dy in ((11, 0), (12, 30))
+)
+TURNS = (
+    '<intersection id="40"><incoming id="41"><incomingLanelet ref="10"/>'
+    '<successorsStraight ref="11"/><successorsLeft ref="12"/></incoming></intersection>'
+)
+
+
+def light(offset: int = 0, direction: str = "all", active: str = "true") -> str:
+    cycle = f"<cycle>{CYCLE}<timeOffset>{offset}</timeOffset></cycle>"
+    more = f"<direction>{direction}</direction><active>{active}</active>"
+    return f'<trafficLight id="30">{cycle}{more}</trafficLight>'
+
+
+@pytest.mark.parametrize("offset", [0, 5, -3, 800])
+def test_a_light_repeats_its_cycle_from_the_offset(path: Path, offset: int) -> None:
+    segment = convert(path, FORK, light(offset), driver(7, steps=range(100, 140)))
+    cycle = [SignalState.GO] * 3 + [SignalState.CAUTION] + [SignalState.STOP] * 4
+    expected = [cycle[(step - offset) % 8] for step in range(100, 140)]
+    assert segment.signal_lane.tolist() == [1, 2]
+    np.testing.assert_array_equal(segment.signal_state, [expected, expected])
+    np.testing.assert_allclose(segment.signal_point + segment.origin, [[50, 0, 0]] * 2, atol=1e-4)
+    assert not convert(path, FORK, light(active="false"), driver(7)).signal_state.any()
+
+
+@pytest.mark.parametrize(
+    ("direction", "lanes"), [("straight", [1]), ("left", [2]), ("leftStraight", [1, 2]), ("right", [])]
+)
+def test_a_light_holds_for_its_directions(path: Path, direction: str, lanes: list[int]) -> None:
+    assert convert(path, FORK, TURNS, light(0, direction), driver(7)).signal_lane.tolist() == lanes

@@ -38,7 +38,7 @@ from symphony.data.generate import (
 from symphony.data.segment import RunSegment
 from symphony.data.selection import interactive_agents, travel, usable
 from symphony.data.sources import sumo
-from symphony.data.sources.sumo import demand, networks, roads
+from symphony.data.sources.sumo import networks, roads, traffic
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
@@ -216,7 +216,7 @@ def test_segments_are_spread_over_the_maps(segments: list[RunSegment]) -> None:
 
 
 @needs_sumo
-@pytest.mark.parametrize(("kind", "seconds", "seed"), [("ramp", 20, 10), ("random", 10, 10)])
+@pytest.mark.parametrize(("kind", "seconds", "seed"), [("town", 10, 10), ("ramp", 20, 10)])
 def test_ego_is_on_the_map_throughout(kind: str, seconds: int, seed: int) -> None:
     rule = dataclasses.replace(sumo.crop_rule(kind, seconds), focuses=4, per_focus=1)
     run = sumo.generate_run(kind, seed, 2.0 * seconds, rule=rule, straight=generation.STRAIGHT)
@@ -236,11 +236,9 @@ def test_routes_go_straight_on_as_often_as_asked(tmp_path: Path) -> None:
     shares = []
     for straight in (0.05, 1.0, 20.0):
         rng = np.random.default_rng(0)
-        routes, _ = demand.write_demand(
-            network, rng, tmp_path, 120.0, through=False, sublane=False, straight=straight
-        )
+        traffic.write_demand(network, rng, tmp_path, 120.0, through=False, sublane=False, straight=straight)
         turns: list[float] = []
-        for route in ET.parse(routes).getroot().iter("route"):  # noqa: S314
+        for route in ET.parse(tmp_path / traffic.ROUTES).getroot().iter("route"):  # noqa: S314
             edges = np.array([number[name] for name in route.attrib["edges"].split()])
             turns += np.abs(np.angle(np.exp(1j * (first[edges[1:]] - last[edges[:-1]])))).tolist()
         shares.append(np.mean(np.array(turns) < 0.6))

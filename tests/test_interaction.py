@@ -22,9 +22,6 @@ def segments(path: Path, **options: object) -> list[RunSegment]:
     return [item for item in items if isinstance(item, RunSegment)]
 
 
-# What a segment holds
-
-
 def test_tracks_of_the_public_layout(tmp_path: Path) -> None:
     path = public(tmp_path, CARS, [*walker("P1"), *walker("P2", speed=6)])
     segment = read_one("interaction", path)
@@ -77,6 +74,12 @@ def test_egos(tmp_path: Path) -> None:
     assert "no moving vehicle is observed at every step" in nobody.message
 
 
+def cases(folder: Path, place: str, rows: list[str]) -> Path:
+    path = folder / f"{place}_train.csv"
+    path.write_text(text(rows, f"case_id,{COLUMNS},track_to_predict,interesting_agent"))
+    return path
+
+
 def test_cases_of_the_newer_layout(tmp_path: Path) -> None:
     (tmp_path / "train").mkdir()
     (tmp_path / "maps").mkdir()
@@ -86,9 +89,7 @@ def test_cases_of_the_newer_layout(tmp_path: Path) -> None:
         both = [*track(1, x=x, steps=range(1, 41)), *track(2, x=x - 12, steps=range(1, 41))]
         rows += [f"{case},{row},{int(k < 40)},0" for k, row in enumerate(both)]
         rows += [f"{case},P1,{k},{100 * k},pedestrian/bicycle,48,{k / 10},0,1,,,,0,1" for k in range(1, 41)]
-    path = tmp_path / "train" / "DR_Y_train.csv"
-    path.write_text(text(rows, f"case_id,{COLUMNS},track_to_predict,interesting_agent"))
-    found = segments(path)
+    found = segments(cases(tmp_path / "train", "DR_Y", rows))
     assert [s.segment_id for s in found] == ["DR_Y_train_case1", "DR_Y_train_case2"]
     assert {s.group for s in found} == {"DR_Y_train"}
     for segment, x in zip(found, (20, 0), strict=True):
@@ -99,19 +100,11 @@ def test_cases_of_the_newer_layout(tmp_path: Path) -> None:
         np.testing.assert_allclose(segment.position[1, 0] + segment.origin, (x + 1, 2, 0), atol=1e-4)
 
 
-def newer(folder: Path, place: str, mapped: str, rows: list[str]) -> Path:
-    """A file of one case, beside the map of a place."""
-    (folder / f"{mapped}.osm_xy").write_text(osm())
-    path = folder / f"{place}_train.csv"
-    rows = [f"1.0,{row},0,0" for row in (*track(1), *track(2, x=-12), *rows)]
-    path.write_text(text(rows, f"case_id,{COLUMNS},track_to_predict,interesting_agent"))
-    return path
-
-
 def test_cases_are_not_put_on_the_map_of_another_place(tmp_path: Path) -> None:
-    assert len(segments(newer(tmp_path, "DR_A", "DR_A", []))) == 1
-    error = read_error("interaction", newer(tmp_path, "DR_B", "DR_A", []))
-    assert "no maps/DR_B.osm" in error.message
+    (tmp_path / "DR_A.osm_xy").write_text(osm())
+    rows = [f"1.0,{row},0,0" for row in (*track(1), *track(2, x=-12))]
+    assert len(segments(cases(tmp_path, "DR_A", rows))) == 1
+    assert "no maps/DR_B.osm" in read_error("interaction", cases(tmp_path, "DR_B", rows)).message
 
 
 def test_lights_of_the_test_area(tmp_path: Path) -> None:
@@ -176,31 +169,30 @@ def test_states_logged_twice(tmp_path: Path) -> None:
 # What is refused
 
 GOOD = text(CARS)
-BROKEN: dict[str, tuple[str, str]] = {
-    "empty": ("", "empty"),
-    "no rows": (COLUMNS + "\n", "no rows"),
-    "cut short": (GOOD[:-1], "cut short"),
-    "a column less": (GOOD.replace(",vy,", ",v,", 1), "0 columns of that name"),
-    "a column twice": (GOOD.replace("frame_id", "x", 1), "2 columns of that name"),
-    "a field less": (GOOD.replace(",car,", ",", 1), "10 fields, expected 11"),
-    "no number": (GOOD.replace(",2.0000,", ",two,", 1), "is not a number"),
-    "infinity": (GOOD.replace(",2.0000,", ",inf,", 1), "is not a number of metres"),
-    "no position": (GOOD.replace(",2.0000,", ",,", 1), "is not a number of metres"),
-    "an unknown type": (GOOD.replace(",car,", ",cow,", 1), "unknown value 'cow'"),
-    "a strange id": (GOOD.replace("\n3,", "\n3;,", 1), "unknown value '3;'"),
-    "half a millisecond": (GOOD.replace(",100,car", ",100.5,car", 1), "no multiples of their usual step"),
-    "uneven times": (GOOD.replace(",100,car", ",130,car"), "no multiples of their usual step"),
-    "one time": (text(track(3, steps=range(1))), "fewer than two steps"),
-    "not ASCII": (GOOD.replace("car", "autó", 1), "not ASCII"),
-    "two types": (GOOD.replace(",car,", ",truck,", 1).replace(",truck,", ",bicycle,", 1), "more than one"),
-    "no size": (GOOD.replace(",4.5,2.0", ",,"), "length and width must be positive"),
-    "another place": (text(track(3, x=9000)), "away from the map"),
-}
+BROKEN = [
+    ("", "empty"),
+    (COLUMNS + "\n", "no rows"),
+    (GOOD[:-1], "cut short"),
+    (GOOD.replace(",vy,", ",v,", 1), "0 columns of that name"),
+    (GOOD.replace("frame_id", "x", 1), "2 columns of that name"),
+    (GOOD.replace(",car,", ",", 1), "10 fields, expected 11"),
+    (GOOD.replace(",2.0000,", ",two,", 1), "'two' can't be read"),
+    (GOOD.replace(",2.0000,", ",inf,", 1), "'inf' can't be read"),
+    (GOOD.replace(",2.0000,", ",,", 1), "'' can't be read"),
+    (GOOD.replace(",car,", ",cow,", 1), "'cow' can't be read"),
+    (GOOD.replace("\n3,", "\n3;,", 1), "'3;' can't be read"),
+    (GOOD.replace(",100,car", ",100.5,car", 1), "no multiples of their usual step"),
+    (GOOD.replace(",100,car", ",130,car"), "no multiples of their usual step"),
+    (text(track(3, steps=range(1))), "fewer than two steps"),
+    (GOOD.replace("car", "autó", 1), "UnicodeDecodeError"),
+    (GOOD.replace(",car,", ",truck,", 1).replace(",truck,", ",bicycle,", 1), "more than one"),
+    (GOOD.replace(",4.5,2.0", ",,"), "length and width must be positive"),
+    (text(track(3, x=9000)), "away from the map"),
+]
 
 
-@pytest.mark.parametrize("name", BROKEN)
-def test_broken_tracks_are_refused_by_name(name: str, tmp_path: Path) -> None:
-    content, message = BROKEN[name]
+@pytest.mark.parametrize(("content", "message"), BROKEN)
+def test_broken_tracks_are_refused_by_name(content: str, message: str, tmp_path: Path) -> None:
     path = public(tmp_path)
     path.write_text(content, encoding="utf-8")
     error = read_error("interaction", path)
@@ -208,46 +200,38 @@ def test_broken_tracks_are_refused_by_name(name: str, tmp_path: Path) -> None:
     assert error.file == path
 
 
-COMPANIONS: dict[str, tuple[str, str | None, str]] = {
-    "no map": ("../../maps/k1.osm", None, "the map is missing"),
-    "a map that is none": ("../../maps/k1.osm", "<osm/>", "has no lanelets"),
-    "no meta data, so another projection": ("meta_data.csv", None, "away from the map"),
-    "no such recording": ("meta_data.csv", META.replace("001", "002"), "0 rows for recording 001"),
-    "no origin": ("meta_data.csv", META.replace("originLat", "lat"), "is not a number"),
-    "maybe phases": ("meta_data.csv", META.replace("yes", "maybe"), "neither yes nor no"),
-    "no phases": ("signal_phases_001.csv", None, "are missing"),
-    "another file": ("signal_phases_001.csv", "a,b\n", "expected rows of"),
-    "an unknown state": ("signal_phases_001.csv", PHASES.replace("DARK", "PINK"), "is no phase"),
-    "no group": ("signal_phases_001.csv", PHASES.replace("\n7,", "\nx,", 1), "is not an integer"),
-    "two states": ("signal_phases_001.csv", PHASES.replace("2000", "1000"), "has two states"),
-    "phases of another time": (
-        "signal_phases_001.csv",
-        PHASES.replace("000,", ","),
-        "the tracks at 11900 ms",
-    ),
-    "no connections": ("k1_map.kml", None, "are missing"),
-    "no lanes": (
-        "k1_map.kml",
-        "<kml xmlns='http://www.opengis.net/kml/2.2'/>",
-        "no lanes with a signal group",
-    ),
-    "a document type": ("k1_map.kml", KML.replace("<kml", "<!DOCTYPE kml><kml", 1), "document type"),
-    "groups that are not there": (
-        "k1_map.kml",
-        KML.replace("7, 8", "17, 18").replace(">8<", ">18<"),
-        "fits a lane",
-    ),
-    "a lane without a name": ("k1_map.kml", KML.replace(">2<", "><", 1), "is not one lane"),
-    "a lane of two names": ("k1_map.kml", KML.replace(">2<", ">2, 3<", 1), "is not one lane"),
-    "a group less": ("k1_map.kml", KML.replace("7, 8", "7"), "1 for 2 sinks"),
-}
+MAP, META_DATA, SIGNALS, LANES = "../../maps/k1.osm", "meta_data.csv", "signal_phases_001.csv", "k1_map.kml"
+COMPANIONS = [
+    (MAP, None, "the map is missing"),
+    (MAP, "<osm/>", "has no lanelets"),
+    (META_DATA, None, "away from the map"),  # another projection
+    (META_DATA, META.replace("001", "002"), "0 rows for recording 001"),
+    (META_DATA, META.replace("originLat", "lat"), "is not a number"),
+    (META_DATA, META.replace("yes", "maybe"), "neither yes nor no"),
+    (META_DATA, META[:-1], "cut short"),
+    (SIGNALS, None, "are missing"),
+    (SIGNALS, "a,b\n", "expected rows of"),
+    (SIGNALS, PHASES[:-1], "cut short"),
+    (SIGNALS, PHASES.replace("DARK", "PINK"), "is no phase"),
+    (SIGNALS, PHASES.replace("\n7,", "\nx,", 1), "is not an integer"),
+    (SIGNALS, PHASES.replace("2000", "1000"), "has two states"),
+    (SIGNALS, PHASES.replace("000,", ","), "the tracks at 11900 ms"),
+    (LANES, None, "are missing"),
+    (LANES, "<kml xmlns='http://www.opengis.net/kml/2.2'/>", "no lanes with a signal group"),
+    (LANES, KML.replace("<kml", "<!DOCTYPE kml><kml", 1), "document type"),
+    (LANES, KML.replace("7, 8", "17, 18").replace(">8<", ">18<"), "fits a lane"),
+    (LANES, KML.replace(">2<", "><", 1), "is not one lane"),
+    (LANES, KML.replace(">2<", ">2, 3<", 1), "is not one lane"),
+    (LANES, KML.replace("7, 8", "7"), "1 for 2 sinks"),
+]
 
 
-@pytest.mark.parametrize("name", COMPANIONS)
-def test_broken_companions_are_refused_by_name(name: str, tmp_path: Path) -> None:
-    file, content, message = COMPANIONS[name]
+@pytest.mark.parametrize(("name", "content", "message"), COMPANIONS)
+def test_broken_companions_are_refused_by_name(
+    name: str, content: str | None, message: str, tmp_path: Path
+) -> None:
     path = taf(tmp_path)
-    companion = (path.parent / file).resolve()
+    companion = (path.parent / name).resolve()
     if content is None:
         companion.unlink()
     else:
@@ -257,28 +241,15 @@ def test_broken_companions_are_refused_by_name(name: str, tmp_path: Path) -> Non
     assert Path(str(error.file)).resolve() in {path, companion}
 
 
-# Damage
-
-
-def one_folder(folder: Path, path: Path) -> Path:
-    """The recording with everything beside it."""
-    for file in [*path.parent.iterdir(), *(path.parents[2] / "maps").iterdir()]:
-        (folder / file.name).write_bytes(file.read_bytes())
-    return folder / path.name
-
-
 @pytest.mark.parametrize("layout", [public, taf])
 def test_conforms(layout: Callable[..., Path], tmp_path: Path) -> None:
-    rows = [*CARS, *track(11, x=-30, speed=8)]
-    extra = [walker("P1")] if layout is public else []
-    path = layout(
-        tmp_path / "tree", *([rows] if layout is public else []), *extra, **({} if extra else {"rows": rows})
-    )
-    report = check_reader(get_reader("interaction"), [path])
-    assert report.segments == 1
-    flat = tmp_path / "flat"
-    flat.mkdir()
-    assert check_reader(get_reader("interaction"), [one_folder(flat, path)]).segments == 1
+    """The recording in its folders, and with everything beside it."""
+    path = layout(tmp_path / "tree", rows=[*CARS, *track(11, x=-30, speed=8)])
+    (tmp_path / "flat").mkdir()
+    for file in [*path.parent.iterdir(), *(path.parents[2] / "maps").iterdir()]:
+        (tmp_path / "flat" / file.name).write_bytes(file.read_bytes())
+    for each in (path, tmp_path / "flat" / path.name):
+        assert check_reader(get_reader("interaction"), [each]).segments == 1
 
 
 @pytest.mark.samples

@@ -1,8 +1,7 @@
-"""Lanelet2 maps: what is read, how lanes connect, and what is refused."""
+"""Lanelet2 maps and their projections: what is read, how lanes connect, and what is refused."""
 
 from __future__ import annotations
 
-import tempfile
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from hypothesis import strategies as st
 from helpers_interaction import BORDER, DASHED, LANELETS, ORIGIN, PARKING, ROAD, WAYS, osm, with_area
 from helpers_sources import off_road
 from symphony.data.segment import LaneType, MarkType, RoadMap
-from symphony.data.sources.geodesy import mercator, utm
+from symphony.data.sources.geodesy import FLATTENING, SEMI_MAJOR, mercator, utm
 from symphony.data.sources.lanelet2 import (
     NO_AREA,
     NO_LANELET,
@@ -42,12 +41,6 @@ def road_of(folder: Path, content: str) -> RoadMap:
     return road_map(read(folder, content), np.zeros(2))
 
 
-def refused(folder: Path, content: str) -> DataError:
-    with pytest.raises(DataError) as caught:
-        road_of(folder, content)
-    return caught.value
-
-
 @pytest.mark.parametrize("how", ["xy", "local", "degrees"])
 def test_lanes_links_and_neighbours(how: str, tmp_path: Path) -> None:
     road = road_of(tmp_path, osm(how))
@@ -70,8 +63,7 @@ def test_marks(tmp_path: Path) -> None:
     road = road_map(source, np.zeros(2))
     kinds = road.mark_type.tolist()
     assert sorted(kinds) == sorted([MarkType.ROAD_LINE] * 3 + [MarkType.STOP_SIGN, MarkType.CROSSWALK])
-    sign = road.marks[kinds.index(MarkType.STOP_SIGN)]
-    np.testing.assert_allclose(sign, [[100, 2, 0]])
+    np.testing.assert_allclose(road.marks[kinds.index(MarkType.STOP_SIGN)], [[100, 2, 0]])
     ring = road.marks[kinds.index(MarkType.CROSSWALK)]
     np.testing.assert_array_equal(ring[0], ring[-1])
     lanes = lane_lanelets(source)
@@ -87,25 +79,23 @@ def test_the_boundary_is_open_at_both_ends(tmp_path: Path) -> None:
     assert len(road.boundary) == 2
 
 
+@settings(max_examples=25)
 @given(st.lists(st.booleans(), min_size=len(WAYS), max_size=len(WAYS)), st.booleans())
-def test_the_direction_ways_are_drawn_in_does_not_matter(turned: list[bool], swapped: bool) -> None:
+def test_the_direction_ways_are_drawn_in_does_not_matter(
+    tmp_path_factory: pytest.TempPathFactory, turned: list[bool], swapped: bool
+) -> None:
     ways = {
         name: (tuple(nodes)[::-1] if turn else tuple(nodes), tags)
         for (name, (nodes, tags)), turn in zip(WAYS.items(), turned, strict=True)
     }
     lanelets = dict(reversed(LANELETS.items())) if swapped else LANELETS
-    with tempfile.TemporaryDirectory() as folder:
-        road, same = (
-            road_of(Path(folder), content) for content in (osm(ways=ways, lanelets=lanelets), osm())
-        )
-    order = np.argsort(road.lane_id)
-    assert {(int(road.lane_id[a]), int(road.lane_id[b])) for a, b in road.successors} == {
-        (101, 103),
-        (102, 104),
-    }
-    left = {(int(road.lane_id[a]), int(road.lane_id[b])) for a, b in road.left_neighbors}
-    assert left == {(101, 102), (103, 104)}
-    for k, lane in enumerate(order):
+    folder = tmp_path_factory.getbasetemp()
+    road, same = road_of(folder, osm(ways=ways, lanelets=lanelets)), road_of(folder, osm())
+    links = [
+        {tuple(pair) for pair in road.lane_id[e].tolist()} for e in (road.successors, road.left_neighbors)
+    ]
+    assert links == [{(101, 103), (102, 104)}, {(101, 102), (103, 104)}]
+    for k, lane in enumerate(np.argsort(road.lane_id)):
         np.testing.assert_allclose(road.lanes[int(lane)], same.lanes[k], atol=1e-6)
 
 
@@ -113,11 +103,9 @@ def test_the_direction_ways_are_drawn_in_does_not_matter(turned: list[bool], swa
     ("tags", "left", "right"),
     [
         (DASHED, True, True),
-        ({"type": "virtual"}, True, True),
         ({}, True, True),
         (BORDER, False, False),
         ({"type": "curbstone"}, False, False),
-        ({"type": "line_thin", "subtype": "solid"}, False, False),
         ({"type": "line_thin", "subtype": "solid_solid"}, False, False),
         ({"type": "line_thin", "subtype": "solid", "lane_change": "yes"}, True, True),
         ({"type": "line_thin", "subtype": "dashed", "lane_change": "no"}, False, False),
@@ -133,98 +121,73 @@ def test_lines_that_may_be_crossed(tags: dict[str, str], left: bool, right: bool
         assert found == ((right, left) if swap else (left, right))
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("50", 50 / 3.6),
-        ("50 km/h", 50 / 3.6),
-        ("25 mph", 25 * 0.44704),
-        ("8.5 m/s", 8.5),
-        ("8.5mps", 8.5),
-        ("de274-60", 60 / 3.6),
-        ("us_r2-1-25", 25 * 0.44704),
-        ("none", np.nan),
-        ("", np.nan),
-        ("900", np.nan),
-    ],
-)
-def test_speed_limits(text: str, expected: float, tmp_path: Path) -> None:
-    rules = {202: ({"subtype": "speed_limit", "sign_type": text}, {})}
-    lanelets = LANELETS | {101: (22, 21, ROAD, (202,))}
-    np.testing.assert_allclose(
-        road_of(tmp_path, osm(lanelets=lanelets, rules=rules)).speed_limit[0], expected, 1e-6
-    )
+SPEEDS = {"50": 50 / 3.6, "50 km/h": 50 / 3.6, "25 mph": 25 * 0.44704, "8.5 m/s": 8.5, "8.5mps": 8.5}
+SPEEDS |= {"de274-60": 60 / 3.6, "us_r2-1-25": 25 * 0.44704, "none": np.nan, "": np.nan, "900": np.nan}
+
+
+def test_speed_limits(tmp_path: Path) -> None:
+    for text, expected in SPEEDS.items():
+        rules = {202: ({"subtype": "speed_limit", "sign_type": text}, {})}
+        content = osm(lanelets=LANELETS | {101: (22, 21, ROAD, (202,))}, rules=rules)
+        np.testing.assert_allclose(road_of(tmp_path, content).speed_limit[0], expected, 1e-6)
 
 
 @settings(max_examples=20)
 @given(turned=st.tuples(*[st.booleans()] * 5), first=st.integers(0, 2))
-def test_areas_belong_to_the_road_but_for_their_holes(turned: tuple[bool, ...], first: int) -> None:
+def test_areas_belong_to_the_road_but_for_their_holes(
+    tmp_path_factory: pytest.TempPathFactory, turned: tuple[bool, ...], first: int
+) -> None:
     outer = ["61o", "62o", "63o"]
     members = " ".join(outer[first:] + outer[:first] + ["64i", "65i"])
-    with tempfile.TemporaryDirectory() as folder:
-        road = road_of(Path(folder), with_area(PARKING, turned, members))
-        plain = road_of(Path(folder), osm())
+    folder = tmp_path_factory.getbasetemp()
+    road, plain = road_of(folder, with_area(PARKING, turned, members)), road_of(folder, osm())
     spots = np.array([(55, 20), (65, 9), (50, 4), (65, 18), (65, 30), (45, 10)])
     assert (off_road(road, spots) < 0).tolist() == [True, True, True, False, False, False]
     assert not (off_road(plain, spots[:2]) < 0).any()
     assert road.lane_id.tolist() == plain.lane_id.tolist()
 
 
-BROKEN: dict[str, tuple[str, str]] = {
-    "no XML": ("this is no map", "not well-formed XML"),
-    "empty": ("", "empty"),
-    "another root": ("<gpx/>", "not an OSM file"),
-    "a document type": (osm().replace("<osm", "<!DOCTYPE osm><osm", 1), "document type"),
-    "an entity": (
-        "<!DOCTYPE osm [<!ENTITY a 'b'>]><osm>&a;</osm>",
-        "document type, which OSM files never do",
-    ),
-    "no lanelets": (osm(lanelets={}), "has no lanelets"),
-    "only crosswalks": (osm(lanelets={105: LANELETS[105]}), "has no lanes"),
-    "an unknown way": (osm(lanelets={101: (22, 99, ROAD, ())}), "there is no way 99"),
-    "no number": (osm().replace("x='50'", "x='fifty'", 1), "is not a number"),
-    "infinity": (osm().replace("x='50'", "x='inf'", 1), "not finite"),
-    "no place": (osm().replace("x='50'", "", 1), "is not a number"),
-    "a pole": (osm("degrees").replace("lat='49.", "lat='89.", 1), "outside latitudes"),
-    "two of one id": (
-        osm().replace("<relation id='102'", "<relation id='101'"),
-        "two lanelets of one id",
-    ),
+BROKEN = {
+    "this is no map": "not well-formed XML",
+    "": "empty",
+    "<gpx/>": "not an OSM file",
+    osm().replace("<osm", "<!DOCTYPE osm><osm", 1): "document type",
+    "<!DOCTYPE osm [<!ENTITY a 'b'>]><osm>&a;</osm>": "document type, which OSM files never do",
+    osm(lanelets={}): "has no lanelets",
+    osm(lanelets={105: LANELETS[105]}): "has no lanes",
+    osm(lanelets={101: (22, 99, ROAD, ())}): "there is no way 99",
+    osm().replace("x='50'", "x='fifty'", 1): "is not a number",
+    osm().replace("x='50'", "x='inf'", 1): "not finite",
+    osm().replace("x='50'", "", 1): "is not a number",
+    osm("degrees").replace("lat='49.", "lat='89.", 1): "outside latitudes",
+    osm().replace("<relation id='102'", "<relation id='101'"): "two lanelets of one id",
 }
 
 
-@pytest.mark.parametrize("name", BROKEN)
-def test_broken_maps_are_refused_by_name(name: str, tmp_path: Path) -> None:
-    content, message = BROKEN[name]
-    error = refused(tmp_path, content)
-    assert message in error.message
-    if name not in {"only crosswalks", "two of one id"}:
-        assert error.file == tmp_path / "made.osm"
+@pytest.mark.parametrize("content", BROKEN, ids=BROKEN.values())
+def test_broken_maps_are_refused_by_name(content: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=BROKEN[content]) as caught:
+        road_of(tmp_path, content)
+    # The reader of recordings adds the file where the map itself is sound.
+    assert caught.value.file in {tmp_path / "made.osm", None}
 
 
-ODD: dict[str, tuple[str, str, str]] = {
-    "one bound": (
-        osm().replace("<member type='way' ref='21' role='right'/>", "", 1),
-        NO_LANELET,
-        "0 ways, expected one",
-    ),
-    "an unknown node": (osm(ways=WAYS | {21: ((1, 77), BORDER)}), NO_NODE, "node 77"),
-    "a bound of one point": (osm(ways=WAYS | {21: ((1,), BORDER)}), NO_LANELET, "fewer than 2 points"),
-    "an open area": (with_area(PARKING, members="61o 62o"), NO_AREA, "is not closed"),
-    "an area in pieces": (with_area(PARKING, members="61o 64o"), NO_AREA, "is not closed"),
-    "an area without an outline": (with_area(PARKING, members="64i 65i"), NO_AREA, "0 outlines"),
-    "an area of two outlines": (with_area(PARKING, members="61o 62o 63o 64o 65o"), NO_AREA, "2 outlines"),
-    "an area with a way missing": (with_area(PARKING, members="61o 99o"), NO_AREA, "there is no way 99"),
-    "an area round one way twice": (with_area(PARKING, members="61o 61o"), NO_AREA, "is not closed"),
-}
-
-
-@pytest.mark.parametrize("name", ODD)
-def test_what_a_map_lacks_is_left_out(name: str, tmp_path: Path) -> None:
-    content, kind, example = ODD[name]
-    path = tmp_path / "made.osm"
-    path.write_text(content)
-    source = read_lanelet2(path, FROM_ORIGIN)
+@pytest.mark.parametrize(
+    ("content", "kind", "example"),
+    [
+        (osm().replace("<member type='way' ref='21' role='right'/>", "", 1), NO_LANELET, "0 ways"),
+        (osm(ways=WAYS | {21: ((1, 77), BORDER)}), NO_NODE, "node 77"),
+        (osm(ways=WAYS | {21: ((1,), BORDER)}), NO_LANELET, "two points"),
+        (with_area(PARKING, members="61o 62o"), NO_AREA, "is not closed"),
+        (with_area(PARKING, members="61o 64o"), NO_AREA, "is not closed"),
+        (with_area(PARKING, members="64i 65i"), NO_AREA, "0 outlines"),
+        (with_area(PARKING, members="61o 62o 63o 64o 65o"), NO_AREA, "2 outlines"),
+        (with_area(PARKING, members="61o 99o"), NO_AREA, "there is no way 99"),
+        (with_area(PARKING, members="61o 61o"), NO_AREA, "is not closed"),
+    ],
+)
+def test_what_a_map_lacks_is_left_out(content: str, kind: str, example: str, tmp_path: Path) -> None:
+    source = read(tmp_path, content)
     assert example in source.odd[kind]
     left = {lanelet.lanelet_id for lanelet in source.lanelets}
     assert left == set(LANELETS) - ({101} if kind != NO_AREA else set())
@@ -240,9 +203,62 @@ def test_sample_maps(samples: Path) -> None:
         projection: Any = partial(utm, origin=np.array([49.0, 8.4]))
         source = read_lanelet2(file, projection)
         road = road_map(source, middle(source))
-        ends = road.lanes.points[road.lanes.offsets[1:] - 1]
-        starts = road.lanes.points[road.lanes.offsets[:-1]]
-        gaps = np.hypot(*(ends[road.successors[:, 0]] - starts[road.successors[:, 1]])[:, :2].T)
+        first, last = (road.lanes.points[road.lanes.offsets[k:][: len(road.lanes)] - k, :2] for k in (0, 1))
+        gaps = np.hypot(*(last[road.successors[:, 0]] - first[road.successors[:, 1]]).T)
         assert len(gaps) >= 30
         assert gaps.max() < 1e-3
         assert 1 < road.lane_width.min() < road.lane_width.max() < 7
+
+
+# Projections
+
+LATITUDES, LONGITUDES = st.floats(-80, 80), st.floats(-179, 179)
+
+
+@pytest.mark.parametrize(
+    ("origin", "place", "by_utm", "by_mercator"),
+    [
+        ((0, 0), (0.0085, 0.0102), (1136.5711, 940.7946), (1135.4588, 946.2157)),
+        ((49.01160993928274, 8.43856470258739), (49.0125, 8.4401), (112.9986, 98.1141), (112.0999, 99.0820)),
+        ((-33.9, 151.2), (-33.91, 151.21), (944.0642, -1092.8055), (923.9654, -1113.2602)),
+    ],
+)
+def test_agrees_with_proj(origin: Any, place: Any, by_utm: Any, by_mercator: Any) -> None:
+    """PROJ 9: ``+proj=utm +zone=N``, and ``+proj=merc +R=6378137 +lat_ts=<origin>``, minus the origin."""
+    for project, expected in ((utm, by_utm), (mercator, by_mercator)):
+        found = project(np.array([place, origin], float), np.array(origin, float))
+        np.testing.assert_allclose(found, [expected, (0, 0)], atol=1e-4)
+
+
+@given(LATITUDES, LONGITUDES, st.floats(-np.pi, np.pi))
+def test_utm_is_conformal_and_true_to_scale(latitude: float, longitude: float, course: float) -> None:
+    """A short step on the ellipsoid keeps its length, to the scale of the grid, and angles between steps."""
+    squared = FLATTENING * (2 - FLATTENING)
+    root = np.sqrt(1 - squared * np.sin(np.radians(latitude)) ** 2)
+    north = SEMI_MAJOR * (1 - squared) / root**3
+    east = SEMI_MAJOR / root * np.cos(np.radians(latitude))
+    origin = np.array([latitude, longitude])
+    turns = course + np.array([0, np.pi / 2])
+    found = utm(origin + np.degrees(np.stack([np.sin(turns) / north, np.cos(turns) / east], axis=-1)), origin)
+    lengths = np.hypot(*found.T)
+    # 0.9996 on the zone's meridian, about 1.0010 at its edge.
+    assert (np.abs(lengths - 1.0003) < 0.0008).all()
+    assert lengths[0] == pytest.approx(lengths[1], rel=1e-5)
+    across = found[0, 0] * found[1, 1] - found[0, 1] * found[1, 0]
+    assert across == pytest.approx(lengths[0] * lengths[1], rel=1e-5)
+
+
+@given(LATITUDES, LONGITUDES)
+def test_mercator_points_north_and_east(latitude: float, longitude: float) -> None:
+    origin = np.array([latitude, longitude])
+    step = np.degrees(1 / SEMI_MAJOR)
+    found = mercator(origin + np.array([[step, 0], [0, step / np.cos(np.radians(latitude))]]), origin)
+    np.testing.assert_allclose(found, [[0, 1], [1, 0]], atol=1e-5)
+
+
+@pytest.mark.parametrize("place", [(85, 0), (-90, 0), (0, 181), (np.nan, 0), (0, np.inf)])
+def test_places_that_are_none(place: tuple[float, float]) -> None:
+    for project in (utm, mercator):
+        for given_ in ((np.array([place]), np.zeros(2)), (np.zeros((1, 2)), np.array(place))):
+            with pytest.raises(DataError, match="outside latitudes"):
+                project(*given_)

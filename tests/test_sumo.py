@@ -1,4 +1,4 @@
-"""Simulated driving, and the built-in data set made of it."""
+"""Simulated driving: laws of its run segments, fresh and built in, the generator, and roads of one's own."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 import shapely
-import torch
 from numpy.typing import NDArray
 
+from helpers_sources import off_road
 from symphony.data.builtin import builtin_store
+from symphony.data.generate import Plan, generate
 from symphony.data.segment import RoadMap, RunSegment, SignalState, content_hash, validate
 from symphony.data.selection import MOVING, interactive_agents, travel, usable
 from symphony.data.sources import sumo
 from symphony.data.sources.sumo import extract, process
+from symphony.data.sources.sumo.networks import kind_name, own_network, town
+from symphony.data.sources.sumo.roads import read_network
 from symphony.data.store import SegmentStore
 from symphony.envs.routes import route_table
-from symphony.errors import DataError
-from symphony.geometry import segments_of, signed_distance
+from symphony.errors import ConfigError, DataError
 from symphony.roadgraph import LaneGraph, route_errors
 
 needs_sumo = pytest.mark.skipif(
@@ -43,20 +45,10 @@ def simulated() -> dict[str, list[RunSegment]]:
 def segments(request: pytest.FixtureRequest) -> list[RunSegment]:
     """Run segments that must satisfy the laws below, fresh and built in."""
     if request.param != "simulated":
-        return list(SegmentStore(builtin_store(request.param)))
+        return list(SegmentStore(builtin_store(request.param)))[::2]
     if importlib.util.find_spec("sumo") is None:
         pytest.skip("SUMO is not installed (pip install 'symphony-traffic[sumo]')")
     return [s for run in request.getfixturevalue("simulated").values() for s in run]
-
-
-def off_road(road: RoadMap, points: NDArray[Any]) -> NDArray[np.float32]:
-    """[M] metres outside the drivable area, negative inside, of points [M, 2]."""
-    start, end, before, after = (
-        torch.as_tensor(part)[None] for part in segments_of(road.boundary.points, road.boundary.offsets)
-    )
-    valid = torch.ones(start.shape[:2], dtype=torch.bool)
-    where = torch.as_tensor(np.ascontiguousarray(points), dtype=torch.float32)[None]
-    return signed_distance(where, start, end, valid, before, after)[0].numpy()
 
 
 def maps(segments: Sequence[RunSegment]) -> list[RoadMap]:
@@ -81,7 +73,7 @@ def boxes(segment: RunSegment, step: int) -> NDArray[Any]:
     return shapely.polygons(segment.position[seen, step, None, :2] + corners)
 
 
-# Laws of all segments -------------------------------------------------------------------------------------------
+# Laws of all segments
 
 
 def test_segments_keep_the_schema_and_the_exclusions(segments: list[RunSegment]) -> None:
@@ -207,9 +199,8 @@ def test_nobody_drives_over_a_red_light(segments: list[RunSegment]) -> None:
     """Few cross the line while their light shows red: none that was red for the last two seconds."""
     crossings = offences = 0
     for s in segments:
-        nose = s.position[..., :2] + s.size[:, None, :1] / 2 * np.stack(
-            [np.cos(s.heading), np.sin(s.heading)], -1
-        )
+        along = np.stack([np.cos(s.heading), np.sin(s.heading)], -1)
+        nose = s.position[..., :2] + s.size[:, None, :1] / 2 * along
         for q, lane in enumerate(s.signal_lane):
             line = shapely.LineString(s.road.lanes[lane][:, :2])
             on = (shapely.distance(line, shapely.points(nose)) < 0.6) & s.valid
@@ -227,14 +218,14 @@ def test_nobody_drives_over_a_red_light(segments: list[RunSegment]) -> None:
     assert offences == 0
 
 
-# The generator --------------------------------------------------------------------------------------------------
+# The generator
 
 
 @needs_sumo
-@pytest.mark.parametrize("kind", ["town", "ramp"])
-def test_same_seed_same_segments(simulated: dict[str, list[RunSegment]], kind: str) -> None:
-    name, seed = next((name, int(name[-1])) for name in simulated if name.startswith(kind))
-    again = sumo.generate_run(kind, seed, 45.0, rule=RULE).segments
+@pytest.mark.parametrize("name", ["town-0", "ramp-1"])
+def test_same_seed_same_segments(simulated: dict[str, list[RunSegment]], name: str) -> None:
+    kind, seed = name.split("-")
+    again = sumo.generate_run(kind, int(seed), 45.0, rule=RULE).segments
     assert [content_hash(s) for s in again] == [content_hash(s) for s in simulated[name]]
 
 
@@ -245,9 +236,7 @@ def test_segments_of_one_focus_share_map_and_origin(simulated: dict[str, list[Ru
         for segment in run:
             by_focus.setdefault(segment.segment_id.split("-w")[0], []).append(segment)
         assert any(len(group) > 1 for group in by_focus.values())
-        for group in by_focus.values():
-            assert len({id(segment.road) for segment in group}) == 1
-            assert len({segment.origin.tobytes() for segment in group}) == 1
+        assert all(len({(id(s.road), s.origin.tobytes()) for s in group}) == 1 for group in by_focus.values())
         assert len({id(segment.road) for segment in run}) == len(by_focus)
 
 
@@ -287,7 +276,89 @@ def test_missing_sumo_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     process.sumo_home.cache_clear()
 
 
-# The built-in set -----------------------------------------------------------------------------------------------
+# Roads of one's own
+
+
+@pytest.fixture(scope="module")
+def networks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The same town as SUMO's network and as OpenDRIVE."""
+    folder = tmp_path_factory.mktemp("roads")
+    made = town(np.random.default_rng(3), folder)
+    process.run_program("netconvert", f"--sumo-net-file {made.name} --opendrive-output town.xodr", folder)
+    return {"sumo": made, "opendrive": (folder / "town.xodr").rename(folder / "own town.xodr")}
+
+
+def driven_length(file: Path) -> float:
+    """Metres of lane for traffic."""
+    _, length, lanes = read_network(file).edge_graph()
+    return float((length * lanes).sum())
+
+
+@needs_sumo
+def test_opendrive_holds_the_roads_that_it_was_made_of(networks: dict[str, Path], tmp_path: Path) -> None:
+    again = own_network(networks["opendrive"], tmp_path)
+    assert driven_length(again) == pytest.approx(driven_length(networks["sumo"]), rel=0.1)
+    junctions = [len(read_network(file).centers) for file in (again, networks["sumo"])]
+    assert junctions[0] == pytest.approx(junctions[1], abs=3)
+
+
+@needs_sumo
+def test_traffic_of_ours_drives_on_them(networks: dict[str, Path], tmp_path: Path) -> None:
+    """Equal arguments give equal stores, another seed other traffic; another file of that name is another plan."""
+    file = tmp_path / "own town.xodr"
+    file.write_bytes(networks["opendrive"].read_bytes())
+    plans = {name: Plan(3, seed=seed, kinds=(str(file),)) for name, seed in (("a", 0), ("b", 0), ("c", 1))}
+    for name, plan in plans.items():
+        assert generate(plan, tmp_path / name).complete
+    a, b, c = (SegmentStore(tmp_path / name) for name in plans)
+    assert [name.split("-")[1] for name in a.ids] == ["own_town"] * 3
+    assert a.checksum() == b.checksum() != c.checksum()
+    file.write_bytes(file.read_bytes() + b"\n")
+    with pytest.raises(ConfigError, match="made with roads"):
+        generate(plans["a"], tmp_path / "a")
+
+
+OSM = """<osm version="0.6">
+{nodes}
+<way id="1">{west}<tag k="highway" v="residential"/></way>
+<way id="2">{south}<tag k="highway" v="residential"/></way>
+<way id="3"><nd ref="6"/><nd ref="7"/><tag k="highway" v="footway"/></way>
+</osm>"""
+
+
+@needs_sumo
+def test_streets_of_openstreetmap_are_driven_and_footways_are_not(tmp_path: Path) -> None:
+    """Two streets of 600 m that cross, and a footway."""
+    places = {1: (0, -3), 2: (0, 0), 3: (0, 3), 4: (-3, 0), 5: (3, 0), 6: (1, 1), 7: (2, 2)}
+    nodes = [
+        f'<node id="{k}" lat="{48 + 0.0009 * x:.6f}" lon="{9 + 0.00134 * y:.6f}"/>'
+        for k, (x, y) in places.items()
+    ]
+    west, south = ("".join(f'<nd ref="{k}"/>' for k in way) for way in ((1, 2, 3), (4, 2, 5)))
+    file = tmp_path / "streets.osm"
+    file.write_text(OSM.format(nodes="\n".join(nodes), west=west, south=south))
+    network = read_network(own_network(file, tmp_path))
+    assert (len(network.centers), len(network.sources())) == (1, 4)
+    assert driven_length(tmp_path / "net.net.xml") == pytest.approx(4 * 600, rel=0.1)
+
+
+@needs_sumo
+@pytest.mark.parametrize("text", ["", "<OpenDRIVE/>", "<nothing", "\0"])
+def test_what_is_no_map_is_an_error_that_names_it(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "roads.xodr"
+    file.write_text(text)
+    with pytest.raises(DataError, match=r"roads\.xodr"):
+        own_network(file, tmp_path)
+    with pytest.raises(ConfigError, match="there is no file"):
+        Plan(1, kinds=("nowhere.xodr",))
+
+
+def test_names_of_files_can_stand_in_names_of_segments() -> None:
+    assert kind_name("/a b/Straße 1.net.xml") == "Stra_e_1"
+    assert kind_name("town") == "town"
+
+
+# The built-in set
 
 
 def test_builtin_sets_are_small_varied_and_apart() -> None:
@@ -303,15 +374,11 @@ def test_builtin_sets_are_small_varied_and_apart() -> None:
     assert not roads_of[0] & roads_of[1]
     for store in stores.values():
         store.verify()
-        kinds = {store.tags(i)["kind"] for i in range(len(store))}
-        assert kinds == {"town", "grid", "ramp"}
+        assert {store.tags(i)["kind"] for i in range(len(store))} == {"town", "grid", "ramp"}
+        turns, lit = zip(
+            *((np.ptp(s.heading[s.ego]) > 0.5, len(s.signal_lane) > 0) for s in store), strict=True
+        )
+        assert 0.25 < np.mean(turns) < 0.8
+        assert np.mean(lit) > 0.25
     folder = builtin_store("train").parent
     assert sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) < 5e6
-
-
-@pytest.mark.parametrize("split", SPLITS)
-def test_builtin_set_has_turns_and_lights(split: Literal["train", "test"]) -> None:
-    store = SegmentStore(builtin_store(split))
-    turns = [np.ptp(s.heading[s.ego]) > 0.5 for s in store]
-    assert 0.25 < np.mean(turns) < 0.8
-    assert np.mean([len(s.signal_lane) > 0 for s in store]) > 0.25

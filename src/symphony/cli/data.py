@@ -54,8 +54,8 @@ class Generate:
     split: Literal["train", "validation", "test"] = "train"
     """Use of the run segments: the three splits never share a network, except for roads of your own."""
     kinds: str = "town"
-    """Kinds of network that take turns, with commas between: town, grid, ramp (freeways), random (no grid), or files
-    with roads of your own: OpenDRIVE (.xodr), OpenStreetMap (.osm) or SUMO (.net.xml)."""
+    """Kinds of network that take turns, with commas between: town, grid, ramp (freeways), or files with roads of
+    your own: OpenDRIVE (.xodr), OpenStreetMap (.osm) or SUMO (.net.xml)."""
     duration: Literal[10, 20, 30] = 10
     """Seconds of a run segment."""
     interactive: int = 2

@@ -12,21 +12,21 @@ from symphony.errors import ConfigError
 __all__ = ["Reader", "get_reader", "readers"]
 
 _READERS = {
-    "argoverse2": ("symphony.data.sources.argoverse2", "Argoverse2Reader"),
-    "commonroad": ("symphony.data.sources.commonroad", "CommonRoadReader"),
-    "interaction": ("symphony.data.sources.interaction", "InteractionReader"),
-    "scenarionet": ("symphony.data.sources.scenarionet", "ScenarioNetReader"),
-    "womd": ("symphony.data.sources.womd", "WomdReader"),
+    "argoverse2": "Argoverse2Reader",
+    "commonroad": "CommonRoadReader",
+    "interaction": "InteractionReader",
+    "scenarionet": "ScenarioNetReader",
+    "womd": "WomdReader",
 }
 
 
 def readers() -> tuple[str, ...]:
-    """Names that :func:`get_reader` knows."""
-    return tuple(sorted(_READERS))
+    """Return the names that :func:`get_reader` knows."""
+    return tuple(_READERS)
 
 
 def get_reader(name: str, **options: Any) -> Reader:
-    """The reader of a format; ``options`` are the keyword arguments of its class.
+    """Return the reader of a format; ``options`` are the keyword arguments of its class.
 
     Raises:
         ConfigError: the name or an option is unknown, or an option has a bad value.
@@ -34,10 +34,8 @@ def get_reader(name: str, **options: Any) -> Reader:
     if name not in _READERS:
         close = difflib.get_close_matches(name.lower(), _READERS, n=1, cutoff=0.4)
         hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise ConfigError(f"unknown data source {name!r} (known: {', '.join(readers())}){hint}")
-    module, attribute = _READERS[name]
+        raise ConfigError(f"unknown data source {name!r} (known: {', '.join(_READERS)}){hint}")
     try:
-        reader: Reader = getattr(importlib.import_module(module), attribute)(**options)
+        return getattr(importlib.import_module(f"{__name__}.{name}"), _READERS[name])(**options)
     except TypeError as error:
         raise ConfigError(f"data source {name!r}: {error}") from error
-    return reader

@@ -1,4 +1,4 @@
-"""What every reader of a log format offers."""
+"""What every reader of a log format offers, and what readers share."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ from symphony.data.bounds import MAX_FILE
 from symphony.data.odd import mended
 from symphony.data.resample import EVEN
 from symphony.data.segment import AgentType, Bools, Floats, RunSegment, validate
-from symphony.errors import DataError
+from symphony.errors import ConfigError, DataError
 
 T = TypeVar("T")
-Item = RunSegment | DataError
-"""One record of a file: a valid run segment, or why there is none."""
-NEAR = 50.0
-"""Metres within which another agent counts as a neighbour of an ego candidate."""
-MOVING = 2.0
-"""Metres an agent must get away from where it is first seen to count as moving."""
+Doubles = NDArray[np.float64]
+Item = RunSegment | DataError  # one record of a file: a valid run segment, or why there is none
+NEAR = 50.0  # metres within which another agent counts as a neighbour of an ego candidate
+MOVING = 2.0  # metres an agent must get away from where it is first seen to count as moving
+
+
+MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""What plain code raises on data that are built otherwise than it expects."""
 
 
 class UnexpectedError(DataError):
@@ -55,12 +57,19 @@ class Reader(ABC):
                 raise DataError("is a folder, expected a file", file=path)
             if path.exists() and not path.is_file():
                 raise DataError("is no ordinary file", file=path)  # a pipe may never end
-            for item in self._read(path):
-                yield self._checked(item, path)
+            items = iter(self._read(path))
+            while True:
+                # Absurd numbers may overflow on the way: the result is not finite, which validation reports.
+                with np.errstate(over="ignore", invalid="ignore"):
+                    item = next(items, None)
+                    found = None if item is None else self._checked(item, path)
+                if found is None:
+                    return
+                yield found
         except DataError as error:
             yield error.at(file=path)
         except OSError as error:
-            yield DataError(f"can't be read: {error.strerror or error}", file=path)
+            yield DataError(f"can't be read: {error.strerror or error}", file=Path(error.filename or path))
         except Exception as error:  # one bad file must not end a conversion
             yield unexpected(error, file=path)
 
@@ -89,27 +98,52 @@ class Reader(ABC):
         """Yield the records, not validated yet; may raise :class:`DataError` where it can't read on."""
 
 
-def readable(kind: str, odd: dict[str, str], read: Callable[..., T | None], *arguments: Any) -> Iterator[T]:
-    """What ``read`` gives, if anything; where it raises a :class:`DataError`, the first of the kind is noted."""
+@contextlib.contextmanager
+def located(*, file: object = None, segment: str | None = None, field: str | None = None) -> Iterator[None]:
+    """Add to a :class:`DataError` the places it does not name; with a field, malformed data raise one as well."""
     try:
-        found = read(*arguments)
+        yield
+    except DataError as error:
+        found = error.at(file=file, segment=segment)
+        found.field = field if found.field is None else found.field
+        raise found from error
+    except MALFORMED as error:
+        if field is None:
+            raise
+        message = f"can't be read: {type(error).__name__}: {str(error)[:80]}"
+        raise DataError(message, file=file, segment=segment, field=field) from error
+
+
+def readable(
+    kind: str, odd: dict[str, str], read: Callable[..., T | None], *arguments: Any, field: str | None = None
+) -> Iterator[T]:
+    """Yield what ``read`` gives, if anything; where it raises a :class:`DataError`, note the first of the kind."""
+    try:
+        with located(field=field):
+            found = read(*arguments)
         if found is not None:
             yield found
     except DataError as error:
         odd.setdefault(kind, f"{error.field}: {error.message}")
 
 
+def refuse(wrong: object, message: str, field: str | None = None, *, file: object = None) -> None:
+    """Raise a :class:`DataError` where something is wrong."""
+    if wrong:
+        raise DataError(message, field=field, file=file)
+
+
 def unexpected(error: Exception, *, file: object = None, segment: str | None = None) -> UnexpectedError:
-    """What a record is reported as that a reader fails on."""
+    """Return what a record is reported as that a reader fails on."""
     message = f"can't be read: {type(error).__name__}: {str(error)[:200]}"
     return UnexpectedError(message, file=file, segment=segment)
 
 
-def read_whole(path: Path) -> bytes:
-    """The content of a file; a :class:`DataError` if it is empty or has more than :data:`MAX_FILE` bytes."""
-    size = path.stat().st_size
-    if size > MAX_FILE:
-        raise DataError(f"{size} bytes, at most {MAX_FILE}: too large for a file of this format", file=path)
+def read_whole(path: Path, most: int | None = None) -> bytes:
+    """Return the content of a file; a :class:`DataError` if it is empty or has more than ``most`` bytes."""
+    size, most = path.stat().st_size, MAX_FILE if most is None else most
+    if size > most:
+        raise DataError(f"{size} bytes, at most {most}: too large for a file of this format", file=path)
     data = path.read_bytes()
     if not data.strip():
         raise DataError("the file is empty", file=path)
@@ -117,30 +151,41 @@ def read_whole(path: Path) -> bytes:
 
 
 def to_float32(array: NDArray[np.float64]) -> Floats:
-    """Narrow, letting numbers out of range become infinite (validation reports them) without a warning."""
+    """Narrow numbers; those out of range become infinite (validation reports them) without a warning."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.asarray(array).astype(np.float32)
 
 
-def codes(values: NDArray[np.int64], count: int, field: str) -> NDArray[np.uint8]:
-    """Enumeration values as uint8; a :class:`DataError` where one is outside 0 … count - 1."""
-    bad = np.unique(values[(values < 0) | (values >= count)])
-    if len(bad):
-        raise DataError(f"unknown value {bad[0]}, expected 0 … {count - 1}", field=field)
-    return values.astype(np.uint8)
+def motion(position: Doubles, heading: Doubles, velocity: Doubles, valid: Bools) -> dict[str, Any]:
+    """Return the fields of a run segment for states; what is not valid becomes 0, and so does an unknown height.
+
+    Args:
+        position: [A, T, 2 or 3], re-centred.
+        heading: [A, T].
+        velocity: [A, T, 2].
+        valid: [A, T].
+    """
+    place = np.pad(position, ((0, 0), (0, 0), (0, 3 - position.shape[-1])))
+    return {
+        "position": to_float32(np.where(valid[..., None], place, 0.0)),
+        "heading": to_float32(np.where(valid, heading, 0.0)),
+        "velocity": to_float32(np.where(valid[..., None], velocity, 0.0)),
+        "valid": valid,
+    }
 
 
 def pairs(links: list[tuple[int, int]]) -> NDArray[np.int32]:
-    """[E, 2] int32 without repeats, in order of first appearance."""
+    """Return [E, 2] int32 without repeats, in order of first appearance."""
     return np.array(list(dict.fromkeys(links)), np.int32).reshape(-1, 2)
 
 
-def time_step(times: NDArray[np.float64], field: str) -> float:
-    """Seconds between steps that begin at ``times`` [T], T at least 2; to the millisecond where that fits the log.
+def time_step(times: Doubles, field: str) -> float:
+    """Return the seconds between steps that begin at ``times`` [T], T at least 2.
 
-    At 15 or 30 Hz it does not: with rounded steps a log would run up to a percent too fast or slow. Where steps are
-    off by more than a tenth it is the usual one, to which :func:`symphony.data.resample.evened` brings the log. A
-    :class:`DataError` where more than a third of the steps are no such ones, or half of them are missing.
+    They are rounded to the millisecond where that fits the log: at 15 or 30 Hz it would run up to a percent too fast
+    or slow. Where steps are off by more than a tenth it is the usual one, to which
+    :func:`symphony.data.resample.evened` brings the log. A :class:`DataError` where more than a third of the steps
+    are no such ones, or half of them are missing.
     """
     gaps = np.diff(times)
     mean = float(gaps.mean())
@@ -160,13 +205,20 @@ def time_step(times: NDArray[np.float64], field: str) -> float:
 def busiest_first(
     agent_id: NDArray[np.int64],
     agent_type: NDArray[np.uint8],
-    position: NDArray[np.float64],
+    position: Doubles,
     valid: Bools,
     dynamic: Bools | None = None,
 ) -> NDArray[np.int64]:
-    """Rows of the vehicles that move and are valid at every step, most moving neighbours first, then lowest id.
+    """Return the rows of the vehicles that move and are valid at every step, the one to be the ego first.
 
-    Takes fields of a segment, positions [A, T, 2] in metres; ``dynamic`` [A] are those that may be egos.
+    That is the one with the most moving neighbours, summed over the steps; then the lowest id.
+
+    Args:
+        agent_id: [A].
+        agent_type: [A].
+        position: [A, T, 2] metres.
+        valid: [A, T].
+        dynamic: [A] which may be egos; by default all.
     """
     # Not the length of the path: the jitter of a parked car's track would add up.
     start = position[np.arange(len(position)), valid.argmax(1), None]
@@ -179,3 +231,18 @@ def busiest_first(
         distance = np.hypot(*np.moveaxis(position[moving] - position[row], -1, 0))
         scores.append(int(((distance < NEAR) & valid[moving]).sum()))
     return rows[np.lexsort((agent_id[rows], -np.array(scores, np.int64)))]
+
+
+def by_ego(segment: RunSegment, candidates: NDArray[np.int64], egos: str) -> Iterator[RunSegment]:
+    """Yield a segment, or one for each candidate in order of id, all in one frame and on one map."""
+    if egos == "one":
+        yield segment
+        return
+    for ego in sorted(candidates.tolist(), key=lambda row: int(segment.agent_id[row])):
+        yield segment.replace(ego=ego, segment_id=f"{segment.segment_id}_ego{segment.agent_id[ego]}")
+
+
+def check_choice(name: str, value: str, *known: str) -> None:
+    """Raise a :class:`ConfigError` where an option of a reader is none of those known."""
+    if value not in known:
+        raise ConfigError(f"{name} must be {' or '.join(map(repr, known))}, is {value!r}")

@@ -3,54 +3,67 @@
 An own reader, because every release of ``commonroad-io`` since 2023 pins protobuf 3.20, which nothing else here
 can live with, and the last that installs (2022.1) brings scipy and does not refuse XML entities.
 
-How the format maps onto :class:`~symphony.data.segment.RunSegment`:
-
 - ``segment_id`` and ``group`` are the benchmark id. Steps run from the first to the last at which any dynamic
-  obstacle exists.
-- Coordinates are taken relative to the first position, rounded to metres, of the ego that ``egos="one"`` picks; z is
-  0 throughout.
-- A state variable given as an interval, or a position given as a region, becomes its middle. The velocity is the
-  logged speed along the logged orientation, or a finite difference of positions where no speed is logged. A box
-  bounds the obstacle's shape (the rectangle itself, usually). Static obstacles are at rest at every step.
-- Types: bicycles are cyclists; cars, trucks, buses, taxis, trains and motorcycles are vehicles; whatever is
-  neither that nor a pedestrian is OTHER; scenery (buildings, pillars, road boundaries, median strips) is left out.
-- A lane is halfway between a lanelet's bounds; neighbours are adjacent lanelets of the same direction. The
-  boundary encloses the union of the lanelets, and is open where the network is cut, at lanelets without successor or
-  predecessor. Sidewalks are left out, crosswalks are marks.
-- Nobody in these files is the ego, so the reader picks one (:class:`CommonRoadReader`).
+  obstacle exists. Coordinates are relative to the first position, in whole metres, of the ego ``egos="one"`` picks.
+- States are exact: predicted ones (intervals, regions, occupancies) are no logged motion. The velocity is the logged
+  speed along the logged orientation, or a difference of positions where none is logged. Static obstacles are at
+  rest; scenery (buildings, pillars, road boundaries, median strips) is left out.
+- A lane is halfway between a lanelet's bounds. Sidewalks are left out, crosswalks are marks; shoulders, parking
+  places and what is restricted belong to the drivable area, but are no lanes. The boundary is open at lanelets
+  without successor or predecessor.
+- As in WOMD, a light belongs to the lane behind it: to each successor of a lanelet that refers to the light, in the
+  light's direction where an intersection tells the successors' directions apart, or to the lanelet itself where it
+  has no successor. The first light of a lane counts. It stands at the stop line, or where the lanelet ends.
 - Obstacles, lanelets, signs and lights that can't be read are left out, and noted.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence, Set
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from symphony.data.bounds import check_counts
-from symphony.data.segment import AgentType, Bools, RunSegment
-from symphony.data.sources.base import Item, Reader, busiest_first, readable, to_float32
-from symphony.data.sources.commonroad_map import read_map
-from symphony.data.sources.xml_files import Doubles, integer, load_xml, number, point, points
-from symphony.errors import ConfigError, DataError
+from symphony.data.bounds import check_counts, check_signals
+from symphony.data.segment import AgentType, Bools, LaneType, MarkType, RunSegment, SignalState
+from symphony.data.sources import base, lines
+from symphony.data.sources.base import Doubles, Item, Reader, by_ego, located, motion, readable, refuse
+from symphony.data.sources.lines import Lane
+from symphony.data.sources.xml_files import integer, load_xml, number
+from symphony.errors import DataError
 
 VERSIONS = ("2018b", "2020a")
 NO_OBSTACLE = "an obstacle left out that can't be read"
+NO_LANELET = "a lanelet left out that can't be read"
+NO_LIGHT = "a traffic light left out that can't be read"
+NO_SIGN = "a traffic sign left out that can't be read"
+MAX_REFERENCES = 200  # references of one kind in a lanelet; junctions have a handful
+MAX_CYCLE = 10**8  # steps in one cycle of a traffic light: more would not fit the arithmetic
 
-_TYPES = {
-    **dict.fromkeys(
-        ("car", "truck", "bus", "priorityVehicle", "parkedVehicle", "train", "motorcycle", "taxi"),
-        AgentType.VEHICLE,
-    ),
-    "pedestrian": AgentType.PEDESTRIAN,
-    "bicycle": AgentType.CYCLIST,
-}
-Box = tuple[tuple[float, float], Doubles, float]
+Box = tuple[Sequence[float], Doubles, float]
 """(length, width) of the box around an obstacle's shape, its centre in the obstacle's frame [2], its turn."""
+_CARS = ("car", "truck", "bus", "priorityVehicle", "parkedVehicle", "train", "motorcycle", "taxi")
+_PEOPLE = {"pedestrian": AgentType.PEDESTRIAN, "bicycle": AgentType.CYCLIST}
+_TYPES = dict.fromkeys(_CARS, AgentType.VEHICLE) | _PEOPLE
 _SCENERY = frozenset({"roadBoundary", "building", "pillar", "median_strip"})
+_LANE_TYPES = (
+    (LaneType.BIKE_LANE, {"bicycleLane"}),
+    (LaneType.FREEWAY, {"highway", "interstate", "mainCarriageWay", "accessRamp", "exitRamp"}),
+    (LaneType.SURFACE_STREET, {"urban", "country", "intersection", "driveWay", "busLane"}),
+)
+_WALKWAYS = frozenset({"sidewalk", "crosswalk"})
+_BESIDE = frozenset({"shoulder", "border", "parking", "restricted"})
+"""Places of the road that are no way to anywhere."""
+_SPEED_SIGNS = frozenset({"274", "R2-1", "r301", "R301"})
+_COLORS = dict.fromkeys(("red", "redYellow"), SignalState.STOP) | {
+    "yellow": SignalState.CAUTION,
+    "green": SignalState.GO,
+    "inactive": SignalState.UNKNOWN,
+}
 
 
 class CommonRoadReader(Reader):
@@ -70,66 +83,52 @@ class CommonRoadReader(Reader):
     patterns = ("*.xml",)
 
     def __init__(self, egos: Literal["one", "all"] = "one") -> None:
-        if egos not in {"one", "all"}:
-            raise ConfigError(f"egos must be 'one' or 'all', is {egos!r}")
+        base.check_choice("egos", egos, "one", "all")
         self.egos = egos
 
     def _read(self, path: Path) -> Iterator[Item]:
-        root = load_xml(path, "CommonRoad")
-        if root.tag != "commonRoad":
-            raise DataError(f"not a CommonRoad file: its root is <{root.tag[:40]}>", field="commonRoad")
-        version = root.get("commonRoadVersion")
-        if version not in VERSIONS:
-            message = f"version {version!r}, expected one of {', '.join(VERSIONS)}"
-            raise DataError(message, field="commonRoadVersion")
-        name = root.get("benchmarkID", "")
-        if not name:
-            raise DataError("missing", field="benchmarkID")
-        try:
+        root = load_xml(path)
+        name, version = root.get("benchmarkID", ""), root.get("commonRoadVersion")
+        refuse(root.tag != "commonRoad", f"not a CommonRoad file, but <{root.tag[:40]}>", "commonRoad")
+        refuse(version not in VERSIONS, f"{version!r}, expected {' or '.join(VERSIONS)}", "commonRoadVersion")
+        refuse(not name, "missing", "benchmarkID")
+        with located(segment=name):
             yield from self._segments(root, name, path)
-        except DataError as error:
-            raise error.at(segment=name) from error
 
     def _segments(self, root: ET.Element, name: str, path: Path) -> Iterator[Item]:
         dt = number(root.get("timeStepSize"), "timeStepSize")
-        if dt <= 0:
-            raise DataError(f"must be positive, is {dt:g}", field="timeStepSize")
+        refuse(dt <= 0, f"must be positive, is {dt:g}", "timeStepSize")
         odd: dict[str, str] = {}
-        tracks, dynamic, first_step = _read_tracks(root, dt, odd)
-        position, valid = tracks["position"], tracks["valid"]
-        candidates = busiest_first(tracks["agent_id"], tracks["agent_type"], position, valid, dynamic)
-        if not len(candidates):
-            raise DataError("no moving vehicle is observed at every step", field="dynamicObstacle")
+        agents, table, valid, dynamic, first_step = _tracks(root, dt, odd)
+        position = table[..., 1:3]
+        candidates = base.busiest_first(agents["agent_id"], agents["agent_type"], position, valid, dynamic)
+        refuse(not len(candidates), "no moving vehicle is observed at every step", "dynamicObstacle")
         ego = int(candidates[0])
         origin = np.round(position[ego, np.argmax(valid[ego])])
-        position = np.where(valid[..., None], position - origin, 0.0)
-        tracks["position"] = to_float32(np.pad(position, ((0, 0), (0, 0), (0, 1))))
         steps = first_step + np.arange(valid.shape[1])
-        first = RunSegment(
+        segment = RunSegment(
             segment_id=name,
             source=self.name,
             dt=dt,
             ego=ego,
-            **tracks,
-            **read_map(root, steps, origin, odd),
+            **agents,
+            **motion(position - origin, table[..., 3], table[..., 4:6], valid),
             origin=np.array([*origin, 0.0]),
+            **_map(root, steps, origin, odd),
             file=path.name,
             group=name,
             odd=odd,
         )
-        if self.egos == "one":
-            yield first
-            return
-        # All in the frame of the first, so that a store keeps one map for them.
-        for ego in sorted(candidates.tolist(), key=lambda row: int(first.agent_id[row])):
-            yield first.replace(ego=ego, segment_id=f"{name}_ego{first.agent_id[ego]}")
+        yield from by_ego(segment, candidates, self.egos)
 
 
-def _read_tracks(root: ET.Element, dt: float, odd: dict[str, str]) -> tuple[dict[str, Any], Bools, int]:
-    """All obstacles of either version of the format, over the steps any dynamic one is present at.
+def _tracks(
+    root: ET.Element, dt: float, odd: dict[str, str]
+) -> tuple[dict[str, Any], Doubles, Bools, Bools, int]:
+    """Return all obstacles of either version, over the steps any dynamic one is present at.
 
-    Gives fields of a run segment in logged coordinates [A, T, ...] (positions are flat), which obstacles [A] are
-    dynamic, and the format's first time step.
+    Gives ids, types and sizes, states [A, T, 6] (see :func:`_state`, with a velocity in place of speeds), where they
+    are valid [A, T], which obstacles [A] are dynamic, and the format's first time step.
     """
     tags = ("dynamicObstacle", "staticObstacle")
     nodes = [(node, tag == tags[0]) for tag in tags for node in root.findall(tag)]
@@ -137,108 +136,92 @@ def _read_tracks(root: ET.Element, dt: float, odd: dict[str, str]) -> tuple[dict
     nodes = [(node, moves) for node, moves in nodes if moves or _text(node, "type") not in _SCENERY]
     nodes.sort(key=lambda entry: not entry[1])
     found = [
-        (each, moves) for node, moves in nodes for each in readable(NO_OBSTACLE, odd, _obstacle, node, moves)
+        (*each, moves) for node, moves in nodes for each in readable(NO_OBSTACLE, odd, _obstacle, node, moves)
     ]
-    logs = [log for (_, _, log, _), moves in found if moves]
-    if not logs:
-        raise DataError(odd.get(NO_OBSTACLE, "has no dynamic obstacles"), field="dynamicObstacle")
+    logs = [log for _, _, log, _, moves in found if moves]
+    refuse(not logs, odd.get(NO_OBSTACLE, "has no dynamic obstacles"), "dynamicObstacle")
     first = min(int(log[:, 0].min()) for log in logs)
     steps = max(int(log[:, 0].max()) for log in logs) - first + 1
-    agents = len(found)
-    check_counts(agents, steps, "time")
-    table = np.full((agents, steps, 6), np.nan)
-    valid = np.zeros((agents, steps), np.bool_)
-    size = np.zeros((agents, 3))
-    for row, ((_, _, log, shape), moves) in enumerate(found):
+    check_counts(len(found), steps, "time")
+    table, valid = np.full((len(found), steps, 6), np.nan), np.zeros((len(found), steps), np.bool_)
+    size = np.zeros((len(found), 3))
+    for row, (_, _, log, (sides, offset, turn), moves) in enumerate(found):
         where = log[:, 0].astype(np.int64) - first if moves else np.arange(steps)
-        table[row, where] = log
-        valid[row, where] = True
-        size[row, :2], offset, turn = shape
-        table[row, :, 1:3] += _rotated(np.broadcast_to(offset, (steps, 2)), table[row, :, 3])
-        velocity = _rotated(table[row, :, 4:6], table[row, :, 3])
+        table[row, where], valid[row, where] = log, True
+        size[row, :2] = sides
+        heading = table[row, :, 3]
+        table[row, :, 1:3] += _rotated(np.broadcast_to(offset, (steps, 2)), heading)
+        velocity = _rotated(table[row, :, 4:6], heading)
         unknown = valid[row] & np.isnan(velocity[:, 0])
         velocity[unknown] = _differences(table[row, :, 1:3], valid[row], dt)[unknown]
         table[row, :, 4:6] = velocity
         table[row, :, 3] += turn
     table[~valid] = 0
-    fields = {
-        "agent_id": np.array([name for (name, *_), _ in found], np.int64),
-        "agent_type": np.array([kind for (_, kind, *_), _ in found], np.uint8),
-        "size": to_float32(size),
-        "position": table[..., 1:3],
-        "heading": to_float32(table[..., 3]),
-        "velocity": to_float32(table[..., 4:6]),
-        "valid": valid,
+    agents = {
+        "agent_id": np.array([each[0] for each in found], np.int64),
+        "agent_type": np.array([each[1] for each in found], np.uint8),
+        "size": base.to_float32(size),
     }
-    return fields, np.array([moves for _, moves in found], np.bool_), first
+    return agents, table, valid, np.array([each[-1] for each in found], np.bool_), first
 
 
 def _text(node: ET.Element, tag: str) -> str:
     return (node.findtext(tag) or "").strip()
 
 
+def _point(node: ET.Element, field: str) -> tuple[float, float]:
+    return number(node.findtext("x"), field), number(node.findtext("y"), field)
+
+
+def _points(node: ET.Element | None, field: str) -> Doubles:
+    """Return [P, 2] the ``point`` children of an element, none if it is missing."""
+    children = [] if node is None else node.findall("point")
+    return np.array([_point(child, field) for child in children], np.float64).reshape(-1, 2)
+
+
+def _references(node: ET.Element, tag: str, field: str) -> list[int]:
+    children, field = node.findall(tag), f"{field}: {tag}"
+    refuse(len(children) > MAX_REFERENCES, f"{len(children)} references, at most {MAX_REFERENCES}", field)
+    return [integer(child.get("ref"), field) for child in children]
+
+
 def _obstacle(node: ET.Element, moves: bool) -> tuple[int, int, Doubles, Box]:
-    """An obstacle: its id, type, states [N, 6] (see :func:`_state`) and box."""
+    """Return an obstacle's id, type, states [N, 6] (see :func:`_state`) and box."""
     name = f"obstacle {node.get('id')}"
-    if node.tag == "obstacle" and _text(node, "role") not in {"dynamic", "static"}:
-        raise DataError(f"unknown role {_text(node, 'role')!r}", field=f"{name}: role")
-    initial = node.find("initialState")
-    if initial is None:
-        raise DataError("missing", field=f"{name}: initialState")
+    role = _text(node, "role") if node.tag == "obstacle" else "dynamic"
+    refuse(role not in {"dynamic", "static"}, f"unknown role {role!r}", f"{name}: role")
+    states = [*node.findall("initialState"), *(node.findall("trajectory/state") if moves else [])]
+    refuse(node.find("initialState") is None, "missing", f"{name}: initialState")
+    log = np.array([_state(state, name, moves) for state in states], np.float64)
     if moves:
-        if node.find("occupancySet") is not None:
-            raise DataError("predicted occupancies are no logged motion", field=f"{name}: occupancySet")
-        states = [initial, *node.findall("trajectory/state")]
-        log = np.array([_state(state, name) for state in states], np.float64)
+        predicted = node.find("occupancySet") is not None
+        refuse(predicted, "predicted occupancies are no logged motion", f"{name}: occupancySet")
         steps, counts = np.unique(log[:, 0], return_counts=True)
-        if (counts > 1).any():
-            raise DataError(f"two states at step {steps[counts > 1][0]:.0f}", field=f"{name}: time")
+        refuse((counts > 1).any(), f"two states at step {steps[counts > 1][:1]}", f"{name}: time")
     else:  # at rest whatever its file says
-        log = np.array([[0, *_state(initial, name, static=True)[1:4], 0, 0]], np.float64)
+        log[:, [0, 4, 5]] = 0
     kind = _TYPES.get(_text(node, "type"), AgentType.OTHER)
     return integer(node.get("id"), "obstacle id"), kind, log, _shape(node, f"{name}: shape")
 
 
-def _state(node: ET.Element, name: str, static: bool = False) -> tuple[float, ...]:
-    """Time step, x, y, heading, forward and lateral speed (NaN where not given)."""
-    found: dict[str, float] = {"time": 0.0, "orientation": 0.0} if static else {}
-    position = None
-    for child in node:
-        field = f"{name}: {child.tag}"
-        if child.tag == "position":
-            position = _center(child, field)
-        elif child.tag in {"time", "orientation", "velocity", "velocityY"}:
-            exact = child.find("exact")
-            texts = [child.findtext("intervalStart"), child.findtext("intervalEnd")]
-            numbers = [number(text, field) for text in (texts if exact is None else [exact.text] * 2)]
-            found[child.tag] = (numbers[0] + numbers[1]) / 2
-    if position is None:
-        raise DataError("missing", field=f"{name}: position")
-    for tag in ("time", "orientation"):
-        if tag not in found:
-            raise DataError("missing", field=f"{name}: {tag}")
-    speeds = found.get("velocity", np.nan), found.get("velocityY", 0.0)
-    return (np.floor(found["time"] + 0.5), *position, found["orientation"], *speeds)
+def _state(node: ET.Element, name: str, moves: bool) -> tuple[float, ...]:
+    """Return time step, x, y, heading, forward and lateral speed (NaN where not given)."""
 
+    def exact(tag: str, default: float | None) -> float:
+        if default is not None and node.find(tag) is None:
+            return default
+        return number(node.findtext(f"{tag}/exact"), f"{name}: {tag}")
 
-def _center(node: ET.Element, field: str) -> tuple[float, float]:
-    """A position: a point, or the centre of the region (rectangle, circle, polygon) it is known to lie in."""
-    exact = node.find("point")
-    if exact is not None:
-        return point(exact, field)
-    corners = points(node.find("polygon"), field)
-    if len(corners):
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        return float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2
-    for shape in ("rectangle", "circle"):
-        middle = node.find(f"{shape}/center")
-        if middle is not None:
-            return point(middle, field)
-    raise DataError("neither a point nor a rectangle, circle or polygon with a centre", field=field)
+    place, needed = node.find("position/point"), None if moves else 0.0
+    if place is None:
+        raise DataError("no point", field=f"{name}: position")
+    speeds = exact("velocity", np.nan), exact("velocityY", 0.0)
+    time = np.floor(exact("time", needed) + 0.5)
+    return time, *_point(place, f"{name}: position"), exact("orientation", needed), *speeds
 
 
 def _differences(position: Doubles, valid: Bools, dt: float) -> Doubles:
-    """[T, 2] velocity from the positions at the neighbouring valid steps, 0 for a single one."""
+    """Return [T, 2] velocity from the positions at the neighbouring valid steps, 0 for a single one."""
     velocity = np.zeros_like(position)
     steps = np.flatnonzero(valid)
     if len(steps) > 1:
@@ -247,52 +230,169 @@ def _differences(position: Doubles, valid: Bools, dt: float) -> Doubles:
 
 
 def _rotated(vectors: Doubles, angle: Doubles | float) -> Doubles:
-    """Vectors [..., 2] turned by angles [...] counter-clockwise."""
+    """Return vectors [..., 2] turned by angles [...] counter-clockwise."""
     cos, sin = np.cos(angle), np.sin(angle)
     x, y = vectors[..., 0], vectors[..., 1]
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def _shape(node: ET.Element, field: str) -> Box:
-    shape = node.find("shape")
-    parts = [part for part in shape if part.tag in _CORNERS] if shape is not None else []
-    if not parts:
-        raise DataError("no rectangle, circle or polygon", field=field)
-    if len(parts) == 1 and parts[0].tag == "rectangle":
-        return _rectangle(parts[0], field)
-    corners = np.concatenate([_CORNERS[part.tag](part, field) for part in parts])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    length, width = (high - low).tolist()
-    return (length, width), (low + high) / 2, 0.0
+    parts = node.findall("shape/*")
+    known = [part for part in parts if part.tag in {"rectangle", "circle", "polygon"}]
+    refuse(len(parts) != 1 or parts != known, "expected one rectangle, circle or polygon", field)
+    (part,) = parts
+    if part.tag == "polygon":
+        corners = _points(part, field)
+        refuse(len(corners) < 3, f"a polygon of {len(corners)} points", field)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        return (high - low).tolist(), (low + high) / 2, 0.0
+    center = part.find("center")
+    middle = np.zeros(2) if center is None else np.array(_point(center, field))
+    if part.tag == "circle":
+        return [2 * number(part.findtext("radius"), field)] * 2, middle, 0.0
+    sides = [number(part.findtext(side), field) for side in ("length", "width")]
+    return sides, middle, number(part.findtext("orientation", "0"), field)
 
 
-def _rectangle(node: ET.Element, field: str) -> Box:
-    size = number(node.findtext("length"), field), number(node.findtext("width"), field)
-    turn = node.findtext("orientation")
-    return size, _middle(node, field), 0.0 if turn is None else number(turn, field)
+@dataclass(frozen=True)
+class _Lanelet:
+    """A lanelet: its lane, halfway between its bounds [P, 2], its types, and what else it says.
+
+    ``marked`` are the bounds that are painted, ``lights`` ids of traffic lights, ``stop`` [2] is where its stop line
+    is, or where it ends.
+    """
+
+    lane: Lane
+    left: Doubles
+    right: Doubles
+    kinds: Set[str]
+    marked: list[Doubles]
+    lights: list[int]
+    stop: Doubles
+
+    @property
+    def ring(self) -> Doubles:
+        """Its closed outline [2 P + 1, 2]."""
+        return np.concatenate([self.left, self.right[::-1], self.left[:1]])
 
 
-def _middle(node: ET.Element, field: str) -> Doubles:
-    middle = node.find("center")
-    return np.array((0.0, 0.0) if middle is None else point(middle, field))
+def _map(root: ET.Element, steps: NDArray[np.int64], origin: Doubles, odd: dict[str, str]) -> dict[str, Any]:
+    """Return map and lights of either version as fields of a run segment, whose time steps [T] are given."""
+    limits: dict[int, float] = {}
+    for node in root.findall("trafficSign"):
+        for limit in readable(NO_SIGN, odd, _speed_limits, node):
+            limits |= limit
+    nodes = root.findall("lanelet")
+    lanelets = [each for node in nodes for each in readable(NO_LANELET, odd, _lanelet, node, limits)]
+    surface = [lanelet for lanelet in lanelets if not lanelet.kinds & _WALKWAYS]
+    ways = [lanelet for lanelet in surface if not lanelet.kinds & _BESIDE]
+    refuse(not ways, f"has no lanes {odd.get(NO_LANELET, '')}".strip(), "lanelet")
+    tags = set((root.get("tags") or "").split()) | {child.tag for child in root.findall("scenarioTags/*")}
+    lanes = [replace(each.lane, kind=each.lane.kind or _lane_type(tags)) for each in ways]
+    rings = lines.drivable_rings([lanelet.ring for lanelet in surface])
+    links = lines.flow([each.lane for each in surface])
+    ends = lines.cut_ends([(each.left, each.right) for each in surface], links)
+    marks = lines.painted(line for each in ways for line in each.marked)
+    marks += [(each.ring, MarkType.CROSSWALK) for each in lanelets if "crosswalk" in each.kinds]
+    return {
+        "road": lines.road_map(lanes, origin, lines.opened(rings, ends), marks),
+        **lines.lights(_signals(root, ways, steps, odd), len(steps), origin),
+    }
 
 
-def _rectangle_corners(node: ET.Element, field: str) -> Doubles:
-    (length, width), place, turn = _rectangle(node, field)
-    return place + _rotated(np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * (length / 2, width / 2), turn)
+def _speed_limits(sign: ET.Element) -> dict[int, float]:
+    """Return sign id -> speed limit in m/s; empty for other signs."""
+    limits = {}
+    for element in sign.findall("trafficSignElement"):
+        value = element.findtext("additionalValue")
+        if _text(element, "trafficSignID") in _SPEED_SIGNS and value is not None:
+            limits[integer(sign.get("id"), "trafficSign id")] = number(value, "trafficSign additionalValue")
+    return limits
 
 
-def _circle_corners(node: ET.Element, field: str) -> Doubles:
-    radius = number(node.findtext("radius"), field)
-    return _middle(node, field) + np.array([[-radius, -radius], [radius, radius]])
+def _lanelet(node: ET.Element, limits: dict[int, float]) -> _Lanelet | None:
+    """Return a lanelet; None where one of its bounds has fewer than two points."""
+    lanelet_id = integer(node.get("id"), "lanelet id")
+    field = f"lanelet {lanelet_id}"
+    bounds = [node.find(f"{side}Bound") for side in ("left", "right")]
+    left, right = (_points(bound, f"{field}: bound") for bound in bounds)
+    if min(len(left), len(right)) < 2:
+        return None
+    if len(left) != len(right):
+        count = max(len(left), len(right))
+        left, right = lines.evenly(left, count), lines.evenly(right, count)
+    speeds = [number(child.text, f"{field}: speedLimit") for child in node.findall("speedLimit")]
+    speeds += [limits[ref] for ref in _references(node, "trafficSignRef", field) if ref in limits]
+    limit = min((speed for speed in speeds if speed > 0), default=np.nan)
+    kinds = {(kind.text or "").strip() for tag in ("laneletType", "type") for kind in node.findall(tag)}
+    flows = [_references(node, tag, field) for tag in ("successor", "predecessor")]
+    same = "[@drivingDir='same']"
+    beside = [_references(node, f"adjacent{side}{same}", field) for side in ("Left", "Right")]
+    center = (left + right) / 2
+    width = lines.median_width(left, right)
+    lane = Lane(lanelet_id, center, _lane_type(kinds), width, limit, *flows, *beside)
+    paint = ["" if bound is None else _text(bound, "lineMarking") for bound in bounds]
+    bare = {"", "no_marking", "unknown"}
+    marked = [line for line, mark in zip((left, right), paint, strict=True) if mark not in bare]
+    line = _points(node.find("stopLine"), f"{field}: stopLine")
+    signals = _references(node, "trafficLightRef", field)
+    return _Lanelet(lane, left, right, kinds, marked, signals, line.mean(axis=0) if len(line) else center[-1])
 
 
-def _polygon_corners(node: ET.Element, field: str) -> Doubles:
-    corners = points(node, field)
-    if len(corners) < 3:
-        raise DataError(f"a polygon of {len(corners)} points", field=field)
-    return corners
+def _lane_type(kinds: Set[str]) -> LaneType:
+    return next((lane_type for lane_type, names in _LANE_TYPES if kinds & names), LaneType.UNDEFINED)
 
 
-_CORNERS = {"rectangle": _rectangle_corners, "circle": _circle_corners, "polygon": _polygon_corners}
-"""Shapes of an obstacle -> points [N, 2] whose bounding box is the shape's."""
+def _signals(
+    root: ET.Element, ways: Sequence[_Lanelet], steps: NDArray[np.int64], odd: dict[str, str]
+) -> dict[int, tuple[Doubles, NDArray[np.uint8]]]:
+    """Return lane -> (stop point [2], state [T]) of the traffic lights."""
+    turns: dict[int, str] = {}
+    for incoming in root.findall("intersection/incoming"):
+        for side in ("Left", "Straight", "Right"):
+            turns |= dict.fromkeys(_references(incoming, f"successors{side}", "intersection"), side.lower())
+    index = {way.lane.name: k for k, way in enumerate(ways)}
+    known: dict[int, tuple[str, NDArray[np.uint8]]] = {}
+    wanted = {ref for way in ways for ref in way.lights}
+    for node in root.findall("trafficLight"):
+        for name, direction, states in readable(NO_LIGHT, odd, _light, node, steps, wanted):
+            known[name] = direction, states
+            check_signals(len(known), len(steps), "trafficLight")
+    found: dict[int, tuple[Doubles, NDArray[np.uint8]]] = {}
+    for k, way in enumerate(ways):
+        after = [index[ref] for ref in way.lane.successors if ref in index]
+        for direction, states in (known[ref] for ref in way.lights if ref in known):
+            for target in after or [k]:
+                turn = turns.get(ways[target].lane.name)
+                if direction == "all" or turn is None or turn in direction:
+                    found.setdefault(target, (way.stop, states))
+        check_signals(len(found), len(steps), "trafficLight")
+    return found
+
+
+def _light(
+    node: ET.Element, steps: NDArray[np.int64], wanted: set[int]
+) -> tuple[int, str, NDArray[np.uint8]] | None:
+    """Return (id, direction, state at each time step) of a light that some lanelet refers to.
+
+    Its cycle repeats, its first element beginning at the time offset.
+    """
+    name = integer(node.get("id"), "trafficLight id")
+    if name not in wanted:
+        return None
+    field = f"trafficLight {name}"
+    direction = (node.findtext("direction") or "all").strip().lower()
+    cycle = node.find("cycle")
+    if cycle is None or node.findtext("active", "true").strip() not in {"true", "1"}:
+        return name, direction, np.full(len(steps), SignalState.UNKNOWN, np.uint8)
+    elements = cycle.findall("cycleElement")
+    colors = [_text(element, "color") for element in elements]
+    unknown = [color for color in colors if color not in _COLORS]
+    refuse(unknown, f"unknown colors {unknown[:3]}", f"{field}: color")
+    durations = [integer(element.findtext("duration"), f"{field}: duration") for element in elements]
+    fine = min(durations, default=0) >= 1 and sum(durations) <= MAX_CYCLE
+    refuse(not fine, "needs elements that last at least one step", f"{field}: cycle")
+    offset = integer(cycle.findtext("timeOffset", "0"), f"{field}: timeOffset") % sum(durations)
+    phase = (steps - offset) % sum(durations)
+    which = np.searchsorted(np.cumsum(durations), phase, side="right")
+    return name, direction, np.array([_COLORS[color] for color in colors], np.uint8)[which]

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from symphony.data.sources.base import Doubles
 from symphony.errors import DataError
 
-Doubles = NDArray[np.float64]
-
-MAX_LATITUDE = 84.0
-"""Degrees up to which UTM is defined."""
-
-SEMI_MAJOR, FLATTENING = 6_378_137.0, 1 / 298.257223563
-"""Of the WGS 84 ellipsoid, metres."""
-
+MAX_LATITUDE = 84.0  # degrees up to which UTM is defined
+SEMI_MAJOR, FLATTENING = 6_378_137.0, 1 / 298.257223563  # of the WGS 84 ellipsoid, metres
 _UTM_SCALE = 0.9996
 
 
@@ -28,40 +22,8 @@ def utm(places: Doubles, origin: Doubles) -> Doubles:
     Takes places [N, 2] and an origin [2] of latitude and longitude in degrees, and gives [N, 2] metres, x towards the
     grid's east, y towards its north. Latitudes beyond 84 degrees are a :class:`DataError`.
     """
-    _check(places)
-    _check(origin)
+    both = _checked(places, origin)
     zone = np.clip(np.floor((origin[1] + 180) / 6), 0, 59)
-    meridian = 6 * zone - 177
-    return _transverse_mercator(places, meridian) - _transverse_mercator(origin[None], meridian)
-
-
-def mercator(places: Doubles, origin: Doubles) -> Doubles:
-    """Spherical Mercator, scaled to be true to length at the origin, relative to the origin.
-
-    The projection of the Test Area Autonomous Driving Baden-Württemberg recordings, and of Lanelet2's
-    ``SphericalMercatorProjector``. Arguments, result and errors as :func:`utm`; y points north.
-    """
-    _check(places)
-    _check(origin)
-    scale = SEMI_MAJOR * np.cos(np.radians(origin[0]))
-
-    def flat(degrees: Doubles) -> Doubles:
-        latitude, longitude = np.radians(degrees).T
-        return scale * np.stack([longitude, np.arctanh(np.sin(latitude))], axis=-1)
-
-    return flat(places) - flat(origin[None])
-
-
-def _check(places: Doubles) -> None:
-    latitude, longitude = np.abs(places.reshape(-1, 2)).T
-    # Comparisons with NaN are false.
-    if not ((latitude <= MAX_LATITUDE) & (longitude <= 180)).all():
-        raise DataError(
-            f"a place outside latitudes ±{MAX_LATITUDE:g} and longitudes ±180 degrees", field="lat, lon"
-        )
-
-
-def _transverse_mercator(places: Doubles, meridian: float) -> Doubles:
     n = FLATTENING / (2 - FLATTENING)
     radius = SEMI_MAJOR / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
     series = (
@@ -70,7 +32,7 @@ def _transverse_mercator(places: Doubles, meridian: float) -> Doubles:
         61 * n**3 / 240 - 103 * n**4 / 140,
         49561 * n**4 / 161280,
     )
-    latitude, longitude = np.radians(places[:, 0]), np.radians(places[:, 1] - meridian)
+    latitude, longitude = np.radians(both - (0, 6 * zone - 177)).T
     eccentricity = np.sqrt(FLATTENING * (2 - FLATTENING))
     sine = np.sin(latitude)
     # Tangent of the conformal latitude.
@@ -81,4 +43,27 @@ def _transverse_mercator(places: Doubles, meridian: float) -> Doubles:
     for k, factor in enumerate(series, start=1):
         x += factor * np.cos(2 * k * xi) * np.sinh(2 * k * eta)
         y += factor * np.sin(2 * k * xi) * np.cosh(2 * k * eta)
-    return _UTM_SCALE * radius * np.stack([x, y], axis=-1)
+    metres = _UTM_SCALE * radius * np.stack([x, y], axis=-1)
+    return metres[:-1] - metres[-1]
+
+
+def mercator(places: Doubles, origin: Doubles) -> Doubles:
+    """Spherical Mercator, scaled to be true to length at the origin, relative to the origin.
+
+    The projection of the Test Area Autonomous Driving Baden-Württemberg recordings, and of Lanelet2's
+    ``SphericalMercatorProjector``. Arguments, result and errors are those of :func:`utm`.
+    """
+    latitude, longitude = np.radians(_checked(places, origin)).T
+    scale = SEMI_MAJOR * np.cos(np.radians(origin[0]))
+    metres = scale * np.stack([longitude, np.arctanh(np.sin(latitude))], axis=-1)
+    return metres[:-1] - metres[-1]
+
+
+def _checked(places: Doubles, origin: Doubles) -> Doubles:
+    """Return [N + 1, 2] degrees, the origin last."""
+    both = np.concatenate([places.reshape(-1, 2), origin[None]])
+    if not (np.abs(both) <= (MAX_LATITUDE, 180)).all():  # comparisons with NaN are false
+        raise DataError(
+            f"a place outside latitudes ±{MAX_LATITUDE:g} and longitudes ±180 degrees", field="lat, lon"
+        )
+    return both

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.resample import EVEN, local_line, wrap
 from symphony.data.segment import AgentType, Bools
-from symphony.data.sources.lines import Doubles
+from symphony.data.sources.base import Doubles, located, refuse
 from symphony.errors import DataError
 
-MAX_BYTES = 1 << 29
-"""Bytes of one file; the largest published ones have a fourth of it."""
-CHUNK = 50_000
-"""Lines that are parsed at a time."""
+MAX_BYTES = 1 << 29  # bytes of one file; the largest published ones have a fourth of it
+CHUNK = 50_000  # lines that are parsed at a time
+NEEDED = ("track_id", "timestamp_ms", "agent_type", "x", "y", "vx", "vy")
 
 _TYPES = {
     **dict.fromkeys(("car", "truck", "bus", "van", "motorcycle"), AgentType.VEHICLE),
@@ -31,14 +31,10 @@ NOMINAL = {AgentType.PEDESTRIAN: (0.7, 0.7), AgentType.CYCLIST: (1.8, 0.7)}
 """Length and width in metres of those whose box the format does not give."""
 CYCLING = 2.5
 """m/s: of the type ``pedestrian/bicycle``, tracks whose fastest tenth is faster are cyclists."""
-MAX_GAP_MS = 1000
-"""Longest time step that is taken for one."""
-SIGMA = 0.2
-"""Seconds: of the Gaussian weights of the line whose slope is the velocity."""
-WALKING = 1.0
-"""m/s above which the direction of motion is a heading."""
-OFF = np.deg2rad(45)
-"""Angle to the motion from which on a logged heading does not count."""
+MAX_GAP_MS = 1000  # longest time step that is taken for one
+SIGMA = 0.2  # seconds: of the Gaussian weights of the line whose slope is the velocity
+WALKING = 1.0  # m/s above which the direction of motion is a heading
+OFF = np.deg2rad(45)  # angle to the motion from which on a logged heading does not count
 _MOVING = 3.0
 _ENOUGH = 20
 _HINT = " (motion='positions' takes both from the positions)"
@@ -68,7 +64,7 @@ class Rows:
         return len(self.time)
 
     def take(self, where: NDArray[np.integer] | slice) -> Rows:
-        """Some of the rows."""
+        """Return some of the rows."""
         return Rows(*(array[where] for array in vars(self).values()))
 
 
@@ -80,146 +76,106 @@ def read_rows(path: Path) -> Rows:
         OSError: the file can't be read.
     """
     size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise DataError(f"{size} bytes, at most {MAX_BYTES} can be read", file=path)
-    try:
-        with path.open("rb") as file:
-            head = file.readline()
-            if not head.strip():
-                raise DataError("the file is empty")
-            names = [name.strip() for name in _text(head, 1).split(",")]
-            for name in ("track_id", "timestamp_ms", "agent_type", "x", "y", "vx", "vy"):
-                if names.count(name) != 1:
-                    raise DataError(f"{names.count(name)} columns of that name, expected one", field=name)
-            parts = [_rows(names, lines, first) for first, lines in _chunks(file)]
-            if not parts:
-                raise DataError("the file has no rows")
-            return joined(*parts)
-    except DataError as error:
-        raise error.at(file=path) from error
+    refuse(size > MAX_BYTES, f"{size} bytes, at most {MAX_BYTES} can be read", file=path)
+    with located(file=path, field="a line"), path.open("rb") as file:
+        head = file.readline()
+        refuse(not head.strip(), "the file is empty")
+        names = [name.strip() for name in head.decode("ascii").rstrip("\r\n").split(",")]
+        for name in NEEDED:
+            refuse(names.count(name) != 1, f"{names.count(name)} columns of that name, expected one", name)
+        parts, first = [], 2
+        while lines := list(itertools.islice(file, CHUNK)):
+            whole = lines[-1].endswith(b"\n")
+            refuse(not whole, "the last line is not complete: the file was cut short", "last line")
+            parts.append(_rows(names, b"".join(lines).decode("ascii"), first))
+            first += len(lines)
+        refuse(not parts, "the file has no rows")
+        return joined(*parts)
 
 
 def joined(*parts: Rows) -> Rows:
-    """The rows of all, by case, time and track."""
+    """Return the rows of all, by case, time and track."""
     rows = Rows(*(np.concatenate(arrays) for arrays in zip(*(vars(p).values() for p in parts), strict=True)))
     return rows.take(np.lexsort((rows.track, rows.time, rows.case)))
 
 
-def _chunks(file: BinaryIO) -> Iterator[tuple[int, list[list[str]]]]:
-    """(number of the first line, fields of each line) of so many lines at a time."""
-    first = 2
-    while lines := list(itertools.islice(file, CHUNK)):
-        if not lines[-1].endswith(b"\n"):
-            last = first + len(lines) - 1
-            raise DataError("the last line is not complete: the file was cut short", field=f"line {last}")
-        yield first, [_text(line, first + k).split(",") for k, line in enumerate(lines)]
-        first += len(lines)
-
-
-def _text(line: bytes, number: int) -> str:
-    try:
-        return line.decode("ascii").rstrip("\r\n")
-    except UnicodeDecodeError as error:
-        raise DataError("not ASCII text", field=f"line {number}") from error
-
-
-def _rows(names: list[str], lines: list[list[str]], first: int) -> Rows:
+def _rows(names: list[str], text: str, first: int) -> Rows:
+    """Parse some lines of a file, of which the first has that number."""
+    lines = [line.rstrip("\r").split(",") for line in text.split("\n")[:-1]]
     for k, line in enumerate(lines):
         if len(line) != len(names):
             raise DataError(f"{len(line)} fields, expected {len(names)}", field=f"line {first + k}")
     columns = dict(zip(names, zip(*lines, strict=True), strict=True))
 
-    def column(name: str, value: Callable[[str], Any], what: str, default: str = "") -> NDArray[Any]:
-        texts = columns.get(name, (default,) * len(lines))
+    def column(name: str, value: Callable[[str], Any], default: str = "") -> NDArray[Any]:
         found = []
-        for k, text in enumerate(texts):
+        for k, entry in enumerate(columns.get(name, (default,) * len(lines))):
             try:
-                found.append(value(text))
+                found.append(value(entry))
             except (KeyError, ValueError):
-                message = f"{what.format(repr(text[:40]))}"
+                message = f"{entry[:40]!r} can't be read"
                 raise DataError(message, field=f"line {first + k}: {name}") from None
         return np.array(found)
 
-    needed = [column(name, _metres, "{} is not a number of metres") for name in ("x", "y", "vx", "vy")]
-    given = [
-        column(n, _metres_or_none, "{} is not a number of metres") for n in ("psi_rad", "length", "width")
-    ]
-    marks = [
-        column(n, _whole, "{} is not a whole number", "0") for n in ("track_to_predict", "interesting_agent")
-    ]
+    needed = [column(name, _number) for name in ("x", "y", "vx", "vy")]
+    given = [column(name, _number_or_none) for name in ("psi_rad", "length", "width")]
+    marks = [column(name, _whole, "0") for name in ("track_to_predict", "interesting_agent")]
     return Rows(
-        case=column("case_id", _whole, "{} is not a whole number", "0"),
-        time=column("timestamp_ms", _time, "{} is not a time"),
-        track=column("track_id", _track_id, "unknown value {}"),
-        kind=column("agent_type", lambda text: int(_TYPES[text.strip().lower()]), "unknown value {}"),
+        case=column("case_id", _whole, "0"),
+        time=column("timestamp_ms", partial(_number, most=2.0**53)),
+        track=column("track_id", _track_id),
+        kind=column("agent_type", lambda text: int(_TYPES[text.strip().lower()])),
         state=np.stack([*needed, *given], axis=-1),
         marks=np.stack(marks, axis=-1) != 0,
     )
 
 
-def _metres(text: str) -> float:
+def _number(text: str, most: float = 1e8) -> float:
     value = float(text)
-    if not abs(value) <= 1e8:
+    if not abs(value) <= most:
         raise ValueError(text)
     return value
 
 
-def _metres_or_none(text: str) -> float:
-    """NaN where a field is empty."""
-    return _metres(text) if text.strip().lower() not in {"", "nan"} else np.nan
-
-
-def _time(text: str) -> float:
-    value = float(text)
-    if not abs(value) < 2**53:
-        raise ValueError(text)
-    return value
+def _number_or_none(text: str) -> float:
+    return _number(text) if text.strip().lower() not in {"", "nan"} else np.nan
 
 
 def _whole(text: str) -> int:
-    value = _time(text)
-    if value != round(value):
-        raise ValueError(text)
-    return int(value)
+    return int(_number(text, 2.0**53))
 
 
 def _track_id(text: str) -> int:
-    text = text.strip()
-    digits = text.removeprefix("P")
+    digits = text.strip().removeprefix("P")
     if not (digits.isdecimal() and len(digits) <= 15):
         raise ValueError(text)
-    return -1 - int(digits) if text.startswith("P") else int(digits)
+    return -1 - int(digits) if text.strip().startswith("P") else int(digits)
 
 
 def stepped(rows: Rows) -> tuple[Rows, float, float]:
-    """(rows with numbers of steps for times, seconds per step, milliseconds at step 0) of a recording.
+    """Return (rows with numbers of steps for times, seconds per step, milliseconds at step 0) of a recording.
 
-    Times may be rounded to milliseconds, so that the steps of 30 Hz look uneven, and frames may be missing.
-
-    Raises:
-        DataError: there are fewer than two times, or they are no multiples of one step.
+    Times may be rounded to milliseconds, so that the steps of 30 Hz look uneven, and frames may be missing. A
+    :class:`DataError` where there are fewer than two times, or they are no multiples of one step.
     """
     times, which = np.unique(rows.time, return_inverse=True)
-    if len(times) < 2:
-        raise DataError("fewer than two steps", field="timestamp_ms")
+    refuse(len(times) < 2, "fewer than two steps", "timestamp_ms")
     gaps = np.diff(times)
     usual = float(np.median(gaps))
     # Gap by gap, so that the error of the usual step does not add up over the recording.
     count = float(np.rint(gaps / usual).sum())
     mean = float(times[-1] - times[0]) / max(count, 1)
-    fitting = (
-        c for c in (float(np.rint(mean)), 1000 / max(np.rint(1000 / mean), 1)) if abs(c - mean) * count <= 1.5
-    )
-    step = next(fitting, mean)
+    whole = float(np.rint(mean)), 1000 / max(np.rint(1000 / mean), 1)  # milliseconds, or frames a second
+    step = next((each for each in whole if abs(each - mean) * count <= 1.5), mean)
     number = np.rint((times - times[0]) / step).astype(np.int64)
     off = np.abs(times - times[0] - number * step) > EVEN * step + 1
-    if not usual <= MAX_GAP_MS or off.any() or (np.diff(number) < 1).any():
-        raise DataError(f"times are no multiples of their usual step of {usual:g} ms", field="timestamp_ms")
+    wrong = not usual <= MAX_GAP_MS or off.any() or (np.diff(number) < 1).any()
+    refuse(wrong, f"times are no multiples of their usual step of {usual:g} ms", "timestamp_ms")
     return replace(rows, time=number[which]), step / 1000, float(times[0])
 
 
 def check_motion(rows: Rows, dt: float, start: float) -> None:
-    """See that velocities and headings of vehicles that move are those of their positions.
+    """Refuse rows whose velocities and headings of vehicles that move are not those of their positions.
 
     Compared over a second: medians over all vehicles, so that single wild tracks do not count.
 
@@ -241,21 +197,18 @@ def check_motion(rows: Rows, dt: float, start: float) -> None:
     one, two = by_track.take(slice(None, -lag)), by_track.take(slice(lag, None))
     both = (one.track == two.track) & (one.case == two.case) & (two.time - one.time == lag)
     both &= (one.kind == AgentType.VEHICLE) & (two.kind == AgentType.VEHICLE)
-    one, two = one.take(np.flatnonzero(both)), two.take(np.flatnonzero(both))
     covered = (two.state[:, :2] - one.state[:, :2]) / (lag * dt)
-    logged = (one.state[:, 2:4] + two.state[:, 2:4]) / 2
-    fast = np.hypot(*covered.T) > _MOVING
+    fast = both & (np.hypot(*covered.T) > _MOVING)
     if fast.sum() < _ENOUGH:
         return
-    covered, logged = covered[fast], logged[fast]
+    covered, logged = covered[fast], ((one.state[:, 2:4] + two.state[:, 2:4]) / 2)[fast]
     course = np.arctan2(*covered.T[::-1])
     ratio = float(np.median(np.hypot(*logged.T) / np.hypot(*covered.T)))
-    if not 0.8 <= ratio <= 1.25:
-        raise DataError(f"velocities are {ratio:.2f} times the speed of the positions{_HINT}", field="vx, vy")
+    far = not 0.8 <= ratio <= 1.25
+    refuse(far, f"velocities are {ratio:.2f} times the speed of the positions{_HINT}", "vx, vy")
     for name, angle in (("vx, vy", np.arctan2(*logged.T[::-1])), ("psi_rad", one.state[fast, 4])):
         error = float(np.nanmedian(np.abs(wrap(angle - course)))) if not np.isnan(angle).all() else 0.0
-        if error > 0.5:
-            raise DataError(f"points {np.degrees(error):.0f} degrees off the motion{_HINT}", field=name)
+        refuse(error > 0.5, f"points {np.degrees(error):.0f} degrees off the motion{_HINT}", name)
 
 
 def _twice(rows: Rows) -> NDArray[np.int64]:
@@ -264,7 +217,7 @@ def _twice(rows: Rows) -> NDArray[np.int64]:
 
 
 def merged(rows: Rows) -> Rows:
-    """Positions and velocities that a track has twice at one time become their mean."""
+    """Return rows in which positions and velocities that a track has twice at one time have become their mean."""
     twice = _twice(rows)
     if not len(twice):
         return rows
@@ -273,12 +226,12 @@ def merged(rows: Rows) -> Rows:
     total = np.zeros((len(first), 4))
     np.add.at(total, number, rows.state[:, :4])
     found = rows.take(first)
-    mean = total / np.bincount(number)[:, None]
-    return replace(found, state=np.concatenate([mean, found.state[:, 4:]], axis=1))
+    found.state[:, :4] = total / np.bincount(number)[:, None]
+    return found
 
 
 def resolved(rows: Rows, dt: float, *, by_positions: bool) -> Rows:
-    """Tracks of the type ``pedestrian/bicycle`` become pedestrians or, if fast (:data:`CYCLING`), cyclists.
+    """Return rows in which ``pedestrian/bicycle`` are pedestrians or, if fast (:data:`CYCLING`), cyclists.
 
     Args:
         rows: those of :func:`stepped`.
@@ -297,7 +250,7 @@ def resolved(rows: Rows, dt: float, *, by_positions: bool) -> Rows:
 
 
 def _speeds(rows: Rows, dt: float) -> Doubles:
-    """[N] m/s to the next state of the same track, at its last from the one before; 0 for a single one."""
+    """Return [N] m/s to the next state of the same track, at its last from the one before; 0 for a single one."""
     order = np.lexsort((rows.time, rows.track, rows.case))
     case, track, time = rows.case[order], rows.track[order], rows.time[order]
     same = (case[1:] == case[:-1]) & (track[1:] == track[:-1])
@@ -310,7 +263,7 @@ def _speeds(rows: Rows, dt: float) -> Doubles:
 
 
 def from_positions(state: Doubles, valid: Bools, dt: float) -> Doubles:
-    """States [A, T, 5] (x, y, velocity, heading) with velocities that are slopes of the positions.
+    """Return states [A, T, 5] (x, y, velocity, heading) with velocities that are slopes of the positions.
 
     Headings that are far off the motion become NaN, which :func:`headings` fills. They are compared with the motion
     at the nearest step at which the agent moves: trackers give 0 to what stands before it moves. An agent that never
@@ -326,7 +279,7 @@ def from_positions(state: Doubles, valid: Bools, dt: float) -> Doubles:
 
 
 def headings(state: Doubles, valid: Bools) -> Doubles:
-    """States [A, T, 5] with the direction of motion for headings that are NaN, or that of the nearest step with one.
+    """Return states [A, T, 5] in which headings that are NaN are the direction of motion at the nearest step.
 
     One that never moves and has no heading gets 0. Masked states become 0.
     """
@@ -337,13 +290,12 @@ def headings(state: Doubles, valid: Bools) -> Doubles:
 
 
 def _nearest_course(state: Doubles, valid: Bools) -> Doubles:
-    """[A, T] direction of motion at the step nearest to each at which the agent moves; NaN if it never does."""
-    velocity = state[..., 2:4]
-    moves = valid & (np.hypot(velocity[..., 0], velocity[..., 1]) > WALKING)
+    """Return [A, T] direction of motion at the nearest step at which the agent moves; NaN if it never does."""
+    course = np.arctan2(state[..., 3], state[..., 2])
+    moves = valid & (np.hypot(state[..., 2], state[..., 3]) > WALKING)
     steps = np.arange(valid.shape[1])
-    course = np.full(valid.shape, np.nan)
+    found = np.full(valid.shape, np.nan)
     for agent in np.flatnonzero(moves.any(axis=1)):
         known = np.flatnonzero(moves[agent])
-        nearest = known[np.abs(steps[:, None] - known).argmin(axis=1)]
-        course[agent] = np.arctan2(velocity[agent, nearest, 1], velocity[agent, nearest, 0])
-    return course
+        found[agent] = course[agent, known[np.abs(steps[:, None] - known).argmin(axis=1)]]
+    return found

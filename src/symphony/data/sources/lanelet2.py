@@ -1,29 +1,23 @@
 """Lanelet2 maps: OpenStreetMap XML whose relations are lanelets and regulatory elements.
 
-What is read, and what becomes of it:
-
-- Every relation of type ``lanelet`` with one way on its left and one on its right, every relation of type
-  ``regulatory_element`` with its lines, and areas (``multipolygon``) that vehicles may use. Elements that an editor
-  marked as deleted do not count.
 - Ways may be drawn in either direction: here both bounds of a lanelet run in its direction of travel, the left one
   on its left. One that is open in both directions counts in the one it is drawn in.
 - A node lies where its file says in metres (attributes ``x``, ``y`` as in INTERACTION's ``.osm_xy`` files, else tags
   ``local_x``, ``local_y``), if that holds for every node; else its latitude and longitude are projected.
-- Lanes are the lanelets for vehicles or bicycles; footways, stairs and rails are left out, crosswalks are marks. A
-  centre line is halfway between points at equal shares of the bounds' lengths.
+- Lanes are the lanelets for vehicles or bicycles; footways, stairs and rails are left out, crosswalks are marks, as
+  are painted lines and stop signs.
 - A lane's successors begin with the two nodes its bounds end with. Its neighbour shares the whole bound between them,
   in the same direction, unless the bound may not be crossed there (a solid line, a kerb, the tag ``lane_change``).
-- The boundary encloses the union of these lanelets and of the areas for vehicles (parking lots, exits, free space),
+- The boundary encloses these lanelets and the areas for vehicles (``multipolygon``: parking lots, exits, free space),
   and is open where no lane goes on (see :func:`.lines.cut_ends`).
-- A stop sign that the map has is a mark; so are painted lines.
-- What can't be read is left out, and noted.
+- What an editor marked as deleted does not count; what can't be read is left out, and noted.
 """
 
 from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,37 +26,21 @@ import shapely
 
 from symphony.data.segment import LaneType, MarkType, RoadMap
 from symphony.data.sources import lines
-from symphony.data.sources.base import pairs, readable
-from symphony.data.sources.lines import (
-    Doubles,
-    Lane,
-    Links,
-    cut_ends,
-    drivable_rings,
-    matched,
-    median_width,
-    opened,
-)
+from symphony.data.sources.base import Doubles, located, pairs, readable, refuse
+from symphony.data.sources.lines import Lane, Links
 from symphony.data.sources.xml_files import integer, load_xml, number
-from symphony.errors import DataError
 
-MAX_NODES = 2_000_000
-"""More than any map of a city district."""
-
-_DRIVABLE = frozenset(
-    {"road", "highway", "play_street", "bus_lane", "emergency_lane", "exit", "parking", "freespace"}
-)
-"""Subtypes of areas on which vehicles may be."""
-
+MAX_NODES = 2_000_000  # more than any map of a city district
 NO_NODE = "a node left out that the map lacks"
 NO_LANELET = "a lanelet left out that can't be read"
 NO_AREA = "an area left out that can't be read"
 
-Projection = Callable[[Doubles], Doubles]
-"""[N, 2] latitude and longitude in degrees to metres."""
+Projection = Callable[[Doubles], Doubles]  # [N, 2] latitude and longitude in degrees to metres
 Tags = dict[str, str]
 
 MPH, KMH = 0.44704, 1 / 3.6
+_DRIVABLE = ["road", "highway", "play_street", "bus_lane", "emergency_lane", "exit", "parking", "freespace"]
+"""Subtypes of areas on which vehicles may be."""
 _NO_LANES = frozenset({"walkway", "shared_walkway", "crosswalk", "stairs", "rail"})
 _TYPES = {
     "bicycle_lane": LaneType.BIKE_LANE,
@@ -79,14 +57,13 @@ _SPEED = re.compile(r"(\d+(?:\.\d+)?)\s*(mph|km/h|kmh|m/s|mps)?\s*$", re.IGNOREC
 class Way:
     """A line: ids of its nodes, its points [P, 2] in metres, and its tags."""
 
-    way_id: int
     nodes: tuple[int, ...]
     line: Doubles
     tags: Tags
 
     def turned(self) -> Way:
-        """The same in the other direction."""
-        return Way(self.way_id, self.nodes[::-1], self.line[::-1], self.tags)
+        """Return the same in the other direction."""
+        return Way(self.nodes[::-1], self.line[::-1], self.tags)
 
 
 @dataclass(frozen=True)
@@ -107,7 +84,7 @@ class Lanelet:
     right: Way
     turned: tuple[bool, bool]
     tags: Tags
-    rules: tuple[int, ...]
+    rules: Sequence[int]
 
     @property
     def subtype(self) -> str:
@@ -116,28 +93,23 @@ class Lanelet:
 
     @property
     def ring(self) -> Doubles:
-        """[P, 2] closed outline."""
+        """Its closed outline [P, 2]."""
         return np.concatenate([self.left.line, self.right.line[::-1], self.left.line[:1]])
 
     @property
     def bounds(self) -> tuple[Doubles, Doubles]:
         """Both bounds with as many points."""
-        return matched(self.left.line, self.right.line, f"lanelet {self.lanelet_id}")
+        return lines.matched(self.left.line, self.right.line, f"lanelet {self.lanelet_id}")
 
     @property
     def center(self) -> Doubles:
-        """[P, 2] the middle line."""
+        """The middle line [P, 2]."""
         left, right = self.bounds
         return (left + right) / 2
 
 
-@dataclass(frozen=True)
-class Rule:
-    """A regulatory element: tags, of which ``subtype`` says what it is, and the stop lines it names."""
-
-    rule_id: int
-    tags: Tags
-    stops: tuple[Way, ...]
+Rules = Mapping[int, tuple[Tags, Sequence[Way]]]
+"""Id of a regulatory element -> its tags, of which ``subtype`` says what it is, and the stop lines it names."""
 
 
 @dataclass(frozen=True)
@@ -147,10 +119,10 @@ class LaneletMap:
     ``odd`` says what was left out, as a map that was cut out of a larger one lacks some of it: kind -> example.
     """
 
-    lanelets: tuple[Lanelet, ...]
-    ways: dict[int, Way]
-    rules: dict[int, Rule]
-    areas: tuple[shapely.Polygon, ...] = ()
+    lanelets: Sequence[Lanelet]
+    ways: Mapping[int, Way]
+    rules: Rules
+    areas: Sequence[shapely.Polygon] = ()
     odd: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -165,31 +137,22 @@ def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
         DataError: it is no OSM XML, declares a document type, a node, way or rule can't be read, or it has no
             lanelets with both bounds; names the file and the element.
     """
-    try:
+    with located(file=path):
         root = load_xml(path, "OSM")
-        if root.tag != "osm":
-            raise DataError(f"not an OSM file: its root is <{root.tag[:40]}>", field="osm")
+        refuse(root.tag != "osm", f"not an OSM file: its root is <{root.tag[:40]}>", "osm")
         odd: dict[str, str] = {}
         ways = _ways(root, projection, odd)
         kinds: dict[str, list[tuple[ET.Element, Tags]]] = {}
         for node in _living(root, "relation"):
             tags = _tags(node)
             kinds.setdefault(tags.get("type", ""), []).append((node, tags))
-        rules = [_rule(node, tags, ways) for node, tags in kinds.get("regulatory_element", ())]
-        wanted = kinds.get("lanelet", ())
-        lanelets = [
-            each for relation in wanted for each in readable(NO_LANELET, odd, _lanelet, *relation, ways)
-        ]
-        if not lanelets:
-            missing = f": {odd[NO_LANELET]}" if NO_LANELET in odd else ""
-            raise DataError(f"has no lanelets{missing}", field="relation")
-        wanted = [each for kind in ("multipolygon", "area") for each in kinds.get(kind, ())]
-        areas = [each for relation in wanted for each in readable(NO_AREA, odd, _area, *relation, ways)]
-        return LaneletMap(tuple(lanelets), ways, {rule.rule_id: rule for rule in rules}, tuple(areas), odd)
-    except DataError as error:
-        raise error.at(file=path) from error
-    except OSError as error:
-        raise DataError(f"can't be read: {error.strerror or error}", file=path) from error
+        rules = dict(_rule(node, tags, ways) for node, tags in kinds.get("regulatory_element", ()))
+        wanted = kinds.get("lanelet", [])
+        lanelets = [each for found in wanted for each in readable(NO_LANELET, odd, _lanelet, *found, ways)]
+        refuse(not lanelets, f"has no lanelets {odd.get(NO_LANELET, '')}".strip(), "relation")
+        wanted = kinds.get("multipolygon", []) + kinds.get("area", [])
+        areas = [each for found in wanted for each in readable(NO_AREA, odd, _area, *found, ways)]
+        return LaneletMap(lanelets, ways, rules, areas, odd)
 
 
 def _living(root: ET.Element, tag: str) -> Iterator[ET.Element]:
@@ -213,42 +176,44 @@ def _ways(root: ET.Element, projection: Projection, odd: dict[str, str]) -> dict
         # The same node twice in a row is a slip of the editor.
         refs = [ref for k, ref in enumerate(refs) if k == 0 or ref != refs[k - 1]]
         line = np.array([places[ref] for ref in refs], np.float64).reshape(-1, 2)
-        ways[way_id] = Way(way_id, tuple(refs), line, _tags(node))
+        ways[way_id] = Way(tuple(refs), line, _tags(node))
     return ways
 
 
 def _places(root: ET.Element, projection: Projection) -> dict[int, Doubles]:
-    """Node id -> [2] metres."""
+    """Return node id -> [2] metres."""
     nodes = list(_living(root, "node"))
-    if len(nodes) > MAX_NODES:
-        raise DataError(f"{len(nodes)} nodes, at most {MAX_NODES} can be read", field="node")
+    refuse(len(nodes) > MAX_NODES, f"{len(nodes)} nodes, at most {MAX_NODES} can be read", "node")
     ids = [integer(node.get("id"), "node id") for node in nodes]
+
+    def numbers(texts: Sequence[tuple[str | None, str | None]], what: str) -> Doubles:
+        both = zip(ids, texts, strict=True)
+        found = [[number(text, f"node {name}: {what}") for text in pair] for name, pair in both]
+        return np.array(found, np.float64).reshape(-1, 2)
+
     local = [(node.get("x"), node.get("y")) for node in nodes]
-    if not all(x is not None and y is not None for x, y in local):
-        tags = [_tags(node) for node in nodes]
-        local = [(tag.get("local_x"), tag.get("local_y")) for tag in tags]
-    if all(x is not None and y is not None for x, y in local):
-        metres = _pairs(ids, local, "x, y")
+    if any(None in pair for pair in local):
+        local = [(tags.get("local_x"), tags.get("local_y")) for tags in map(_tags, nodes)]
+    if any(None in pair for pair in local):
+        metres = projection(numbers([(node.get("lat"), node.get("lon")) for node in nodes], "lat, lon"))
     else:
-        degrees = _pairs(ids, [(node.get("lat"), node.get("lon")) for node in nodes], "lat, lon")
-        metres = projection(degrees)
+        metres = numbers(local, "x, y")
     return dict(zip(ids, metres, strict=True))
 
 
-def _pairs(ids: list[int], texts: list[tuple[str | None, str | None]], what: str) -> Doubles:
-    found = [
-        [number(text, f"node {name}: {what}") for text in pair] for name, pair in zip(ids, texts, strict=True)
-    ]
-    return np.array(found, np.float64).reshape(-1, 2)
-
-
 def _members(node: ET.Element, kind: str, field: str) -> dict[str, list[int]]:
-    """Role -> references of a relation's members of a kind."""
+    """Return role -> references of a relation's members of a kind."""
     found: dict[str, list[int]] = {}
     for child in node.findall("member"):
         if child.get("type") == kind:
             found.setdefault(child.get("role", ""), []).append(integer(child.get("ref"), field))
     return found
+
+
+def _way(ref: int, ways: dict[int, Way], field: str) -> Way:
+    fine = ref in ways and len(ways[ref].line) > 1
+    refuse(not fine, f"there is no way {ref} of two points or more", field)
+    return ways[ref]
 
 
 def _lanelet(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> Lanelet:
@@ -258,110 +223,96 @@ def _lanelet(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> Lanelet:
     bounds = []
     for side in ("left", "right"):
         refs = members.get(side, [])
-        if len(refs) != 1:
-            raise DataError(f"{len(refs)} ways, expected one", field=f"{field}: {side}")
-        if refs[0] not in ways:
-            raise DataError(f"there is no way {refs[0]}", field=f"{field}: {side}")
-        if len(ways[refs[0]].line) < 2:
-            raise DataError("a bound of fewer than 2 points", field=f"{field}: {side}")
-        bounds.append(ways[refs[0]])
+        refuse(len(refs) != 1, f"{len(refs)} ways, expected one", f"{field}: {side}")
+        bounds.append(_way(refs[0], ways, f"{field}: {side}"))
     left, right, turned = _aligned(*bounds)
     rules = _members(node, "relation", field).get("regulatory_element", [])
-    return Lanelet(lanelet_id, left, right, turned, tags, tuple(rules))
+    return Lanelet(lanelet_id, left, right, turned, tags, rules)
 
 
 def _aligned(left: Way, right: Way) -> tuple[Way, Way, tuple[bool, bool]]:
-    """Both bounds in the direction in which the left one is on the left."""
+    """Return both bounds in the direction in which the left one is on the left."""
     ends = left.line[[0, -1]]
     apart, crossed = (np.hypot(*(ends - right.line[rows]).T).sum() for rows in ([0, -1], [-1, 0]))
     twist = bool(crossed < apart)
     along = right.turned() if twist else right
     ring = np.concatenate([left.line, along.line[::-1]])
-    ring = ring - ring[0]
-    x, y = ring.T
+    x, y = (ring - ring[0]).T
     # Forth on the left and back on the right goes round clockwise.
-    backwards = bool((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() > 0)
-    if backwards:
+    if (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() > 0:
         return left.turned(), along.turned(), (True, not twist)
     return left, along, (False, twist)
 
 
-def _for_vehicles(tags: Tags) -> bool:
-    """Whether vehicles may be on an area: as its participants say, else by its subtype."""
-    named = {name: value for name, value in tags.items() if name.startswith("participant:")}
-    if named:
-        return any(name.startswith("participant:vehicle") and value == "yes" for name, value in named.items())
-    return tags.get("subtype") in _DRIVABLE
-
-
 def _area(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> shapely.Polygon | None:
-    """A place for vehicles that has no direction, such as a parking lot; None for others."""
-    if not _for_vehicles(tags):
+    """Return a place for vehicles that has no direction, such as a parking lot; None for others.
+
+    Its participants say who may be there, else its subtype.
+    """
+    named = {name: value for name, value in tags.items() if name.startswith("participant:")}
+    allowed = any(n.startswith("participant:vehicle") and value == "yes" for n, value in named.items())
+    if not (allowed if named else tags.get("subtype") in _DRIVABLE):
         return None
     field = f"area {integer(node.get('id'), 'relation id')}"
     members = _members(node, "way", field)
     outer, inner = (_closed(members.get(role, []), ways, f"{field}: {role}") for role in ("outer", "inner"))
-    if len(outer) != 1:
-        raise DataError(f"{len(outer)} outlines, expected one", field=f"{field}: outer")
+    refuse(len(outer) != 1, f"{len(outer)} outlines, expected one", f"{field}: outer")
     return shapely.Polygon(outer[0].exterior, [hole.exterior for hole in inner])
 
 
 def _closed(refs: list[int], ways: dict[int, Way], field: str) -> list[shapely.Polygon]:
-    """What ways that meet in their nodes enclose, drawn in either direction."""
-    absent = [ref for ref in refs if ref not in ways or len(ways[ref].line) < 2]
-    if absent:
-        raise DataError(f"there is no way {absent[0]} of two points or more", field=field)
-    found, *rest = shapely.polygonize_full([shapely.LineString(ways[ref].line) for ref in refs])
-    if any(len(each.geoms) for each in rest):
-        raise DataError("is not closed", field=field)
+    """Return what ways that meet in their nodes enclose, drawn in either direction."""
+    found, *rest = shapely.polygonize_full([shapely.LineString(_way(ref, ways, field).line) for ref in refs])
+    refuse(any(len(each.geoms) for each in rest), "is not closed", field)
     return list(found.geoms)
 
 
-def _rule(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> Rule:
+def _rule(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> tuple[int, tuple[Tags, list[Way]]]:
     rule_id = integer(node.get("id"), "relation id")
     refs = _members(node, "way", f"regulatory element {rule_id}").get("ref_line", [])
     # Lines outside the map's section are missing in it.
-    return Rule(rule_id, tags, tuple(ways[ref] for ref in refs if ref in ways and len(ways[ref].line)))
+    return rule_id, (tags, [ways[ref] for ref in refs if ref in ways and len(ways[ref].line)])
 
 
-def lane_lanelets(source: LaneletMap) -> tuple[Lanelet, ...]:
-    """The lanelets that are lanes, at least one; lane k of :func:`road_map` is number k."""
-    lanes = tuple(lanelet for lanelet in source.lanelets if lanelet.subtype not in _NO_LANES)
-    if not lanes:
-        raise DataError("has no lanes", field="lanelet")
-    if len({lane.lanelet_id for lane in lanes}) < len(lanes):
-        raise DataError("two lanelets of one id", field="lanelet")
+def lane_lanelets(source: LaneletMap) -> list[Lanelet]:
+    """Return the lanelets that are lanes, at least one; lane k of :func:`road_map` is number k."""
+    lanes = [lanelet for lanelet in source.lanelets if lanelet.subtype not in _NO_LANES]
+    refuse(not lanes, "has no lanes", "lanelet")
+    refuse(len({lane.lanelet_id for lane in lanes}) < len(lanes), "two lanelets of one id", "lanelet")
     return lanes
 
 
 def middle(source: LaneletMap) -> Doubles:
-    """[2] the middle of the box around all lanes, rounded to metres: an origin for everything on the map."""
+    """Return the middle [2] of the box around all lanes, rounded to metres: an origin for everything on the map."""
     points = np.concatenate([lane.ring for lane in lane_lanelets(source)])
     return np.round((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
 def road_map(source: LaneletMap, origin: Doubles) -> RoadMap:
-    """The map relative to an origin [2]; z is 0. A :class:`DataError` says if no area can be formed of its lanes."""
+    """Return the map relative to an origin [2]; z is 0.
+
+    A :class:`DataError` says if no area can be formed of its lanes.
+    """
     ways = lane_lanelets(source)
     lanes = [
         Lane(
             way.lanelet_id,
             way.center,
             _TYPES.get(way.subtype, LaneType.SURFACE_STREET),
-            median_width(*way.bounds),
+            lines.median_width(*way.bounds),
             _speed_limit(way, source.rules),
         )
         for way in ways
     ]
     links = successors(ways)
-    rings = drivable_rings([*(way.ring for way in ways), *source.areas], field="lanelet, area")
-    boundary = opened(rings, cut_ends([(way.left.line, way.right.line) for way in ways], links))
+    rings = lines.drivable_rings([*(way.ring for way in ways), *source.areas], field="lanelet, area")
+    boundary = lines.opened(rings, lines.cut_ends([(way.left.line, way.right.line) for way in ways], links))
     beside = _beside(ways, left=True), _beside(ways, left=False)
     return lines.road_map(lanes, origin, boundary, list(_marks(source)), links=links, beside=beside)
 
 
 def successors(lanes: Sequence[Lanelet]) -> Links:
-    """[E, 2] lane indices (from, to)."""
+    """Return [E, 2] lane indices (from, to)."""
     starts: dict[tuple[int, int], list[int]] = {}
     for k, lane in enumerate(lanes):
         starts.setdefault((lane.left.nodes[0], lane.right.nodes[0]), []).append(k)
@@ -370,7 +321,7 @@ def successors(lanes: Sequence[Lanelet]) -> Links:
 
 
 def _beside(lanes: Sequence[Lanelet], left: bool) -> Links:
-    """[E, 2] (lane, the one on that side that a lane change may reach)."""
+    """Return [E, 2] (lane, the one on that side that a lane change may reach)."""
     others: dict[tuple[int, ...], list[int]] = {}
     for k, lane in enumerate(lanes):
         others.setdefault((lane.right if left else lane.left).nodes, []).append(k)
@@ -383,7 +334,7 @@ def _beside(lanes: Sequence[Lanelet], left: bool) -> Links:
 
 
 def _may_cross(bound: Way, turned: bool, to_left: bool) -> bool:
-    """Whether the line between two lanes may be crossed; of unknown and unmarked ones it is assumed."""
+    """Return whether the line between two lanes may be crossed; of unknown and unmarked ones it is assumed."""
     explicit = bound.tags.get("lane_change")
     if explicit in {"yes", "no"}:
         return explicit == "yes"
@@ -395,17 +346,17 @@ def _may_cross(bound: Way, turned: bool, to_left: bool) -> bool:
     return near != "solid"
 
 
-def _speed_limit(lane: Lanelet, rules: dict[int, Rule]) -> float:
-    """m/s: the lowest of the lanelet's own tags and its rules; NaN where none can be understood."""
+def _speed_limit(lane: Lanelet, rules: Rules) -> float:
+    """Return m/s: the lowest of the lanelet's own tags and its rules; NaN where none can be understood."""
     texts = [lane.tags.get(name, "") for name in ("speed_limit", "maxspeed")]
-    for rule in (rules[ref] for ref in lane.rules if ref in rules):
-        if rule.tags.get("subtype") == "speed_limit":
-            texts.append(rule.tags.get("limit") or rule.tags.get("sign_type", ""))
+    for tags, _ in (rules[ref] for ref in lane.rules if ref in rules):
+        if tags.get("subtype") == "speed_limit":
+            texts.append(tags.get("limit") or tags.get("sign_type", ""))
     return min((speed for speed in map(_speed, texts) if 0 < speed < 60), default=np.nan)
 
 
 def _speed(text: str) -> float:
-    """Of ``50``, ``50 km/h``, ``25 mph``, ``de274-50``, ``us_r2-1-25``; km/h where there is no unit; else 0."""
+    """Return m/s of ``50``, ``50 km/h``, ``25 mph``, ``de274-50``, ``us_r2-1-25``; without a unit km/h; else 0."""
     found = _SPEED.search(text)
     if found is None:
         return 0.0
@@ -413,26 +364,22 @@ def _speed(text: str) -> float:
     return float(found[1]) * {"mph": MPH, "m/s": 1.0, "mps": 1.0}.get(unit, KMH)
 
 
-def _marks(source: LaneletMap) -> Iterable[tuple[Doubles, MarkType]]:
+def _marks(source: LaneletMap) -> Iterator[tuple[Doubles, MarkType]]:
     for way in source.ways.values():
         kind = way.tags.get("type")
         if kind in _PAINT and len(way.line) > 1:
             yield way.line, MarkType.ROAD_LINE
-        elif kind == "traffic_sign" and len(way.line) and _is_stop(way.tags):
+        names = [way.tags.get(name, "") for name in ("subtype", "sign_type")]
+        if kind == "traffic_sign" and len(way.line) and any(map(_STOP_SIGNS.search, names)):
             yield way.line.mean(axis=0, keepdims=True), MarkType.STOP_SIGN
     for lanelet in source.lanelets:
         if lanelet.subtype == "crosswalk":
             yield lanelet.ring, MarkType.CROSSWALK
 
 
-def stop_line(lane: Lanelet, rules: dict[int, Rule]) -> Doubles | None:
-    """[2] the middle of the stop line that a traffic light of the lanelet names; None where none does."""
-    for rule in (rules[ref] for ref in lane.rules if ref in rules):
-        if rule.tags.get("subtype") == "traffic_light":
-            for way in rule.stops:
-                return way.line.mean(axis=0)
+def stop_line(lane: Lanelet, rules: Rules) -> Doubles | None:
+    """Return the middle [2] of the stop line that a traffic light of the lanelet names; None where none does."""
+    for tags, ways in (rules[ref] for ref in lane.rules if ref in rules):
+        if tags.get("subtype") == "traffic_light" and ways:
+            return ways[0].line.mean(axis=0)
     return None
-
-
-def _is_stop(tags: Tags) -> bool:
-    return any(_STOP_SIGNS.search(tags.get(name, "")) for name in ("subtype", "sign_type"))

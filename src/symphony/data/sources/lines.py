@@ -11,12 +11,11 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.polygon import orient
 
-from symphony.data.segment import MarkType, Polylines, RoadMap
-from symphony.data.sources.base import pairs, to_float32
+from symphony.data.segment import Bools, MarkType, Polylines, RoadMap
+from symphony.data.sources.base import Doubles, pairs, refuse, to_float32
 from symphony.errors import DataError
 
-Doubles = NDArray[np.float64]
-
+Links = NDArray[np.int32]  # [E, 2] lane indices (from, to)
 MAX_EDGES = 500_000
 MAX_NEAR, MAX_CROSSINGS, MAX_KNOTS = 2_000_000, 50_000, 500
 """Edges of outlines, pairs of them whose boxes overlap, pairs that cross, and pairs of one outline that do: the time
@@ -27,8 +26,7 @@ MAX_BOUND, SPACING = 10_000.0, 2.0
 """Metres of a lane's bound, at most, and between the points of a centre line."""
 CUT = 0.3
 """Metres by which a ring may miss the cut it was closed along."""
-SLIT = 0.1
-"""Metres by which neighbouring areas may miss each other on either side and still bound no slit."""
+SLIT = 0.1  # metres by which neighbouring areas may miss each other on either side and still bound no slit
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class Lane:
         successors: ids of lanes that traffic flows into.
         predecessors: ids of lanes that traffic comes from.
         left: ids of the neighbours on the left that a lane change may reach.
-        right: ids of those on the right.
+        right: ids of the neighbours on the right.
     """
 
     name: Any
@@ -58,18 +56,14 @@ class Lane:
     right: Iterable[Any] = ()
 
 
-Links = NDArray[np.int32]
-"""[E, 2] lane indices (from, to)."""
-
-
 def named(lanes: Sequence[Lane], field: str) -> list[tuple[int, int]]:
-    """(lane, lane it names in a field) by index; names of lanes that are not there are left out."""
+    """Return (lane, lane it names in a field) by index; names of lanes that are not there are left out."""
     index = {lane.name: k for k, lane in enumerate(lanes)}
     return [(k, index[ref]) for k, lane in enumerate(lanes) for ref in getattr(lane, field) if ref in index]
 
 
 def flow(lanes: Sequence[Lane]) -> Links:
-    """Which lanes lead to which, as either of the two tells."""
+    """Return which lanes lead to which, as either of the two tells."""
     return pairs(named(lanes, "successors") + [(b, a) for a, b in named(lanes, "predecessors")])
 
 
@@ -83,7 +77,7 @@ def road_map(
     beside: tuple[Links, Links] | None = None,
     ids: Sequence[int] | None = None,
 ) -> RoadMap:
-    """The map relative to an origin [2 or 3]; z is 0 where lines have none.
+    """Return the map relative to an origin [2 or 3]; z is 0 where lines have none.
 
     Args:
         lanes: the lanes.
@@ -94,10 +88,14 @@ def road_map(
         beside: left and right neighbours; by default what the lanes say.
         ids: numbers of the lanes; by default their names, which are numbers.
     """
+
+    def local(lines: Iterable[Doubles]) -> Polylines:
+        return Polylines.of([to_float32(line - origin[: line.shape[1]]) for line in lines])
+
     left, right = beside or (pairs(named(lanes, "left")), pairs(named(lanes, "right")))
     widths = np.array([lane.width for lane in lanes], np.float64)
     return RoadMap(
-        lanes=polylines([lane.line for lane in lanes], origin),
+        lanes=local(lane.line for lane in lanes),
         lane_id=np.array([lane.name for lane in lanes] if ids is None else ids, np.int64),
         lane_type=np.array([lane.kind for lane in lanes], np.uint8),
         speed_limit=to_float32(np.array([lane.speed_limit for lane in lanes], np.float64)),
@@ -105,19 +103,14 @@ def road_map(
         successors=flow(lanes) if links is None else links,
         left_neighbors=left,
         right_neighbors=right,
-        boundary=polylines(boundary, origin),
-        marks=polylines([line for line, _ in marks], origin),
+        boundary=local(boundary),
+        marks=local(line for line, _ in marks),
         mark_type=np.array([kind for _, kind in marks], np.uint8),
     )
 
 
-def polylines(lines: Sequence[Doubles], origin: Doubles) -> Polylines:
-    """Lines [P, 2 or 3] relative to an origin [2 or 3]."""
-    return Polylines.of([to_float32(line - origin[: line.shape[1]]) for line in lines])
-
-
 def lights(found: Mapping[int, tuple[Doubles, Any]], steps: int, origin: Doubles) -> dict[str, Any]:
-    """The fields of a run segment for lights: lane -> (stop point [2 or 3], states [T])."""
+    """Return the fields of a run segment for lights: lane -> (stop point [2 or 3], states [T])."""
     points = np.array([point - origin for point, _ in found.values()]).reshape(-1, len(origin))
     return {
         "signal_lane": np.array(list(found), np.int32),
@@ -126,111 +119,100 @@ def lights(found: Mapping[int, tuple[Doubles, Any]], steps: int, origin: Doubles
     }
 
 
-def painted(bounds: Iterable[Doubles]) -> list[Doubles]:
-    """Painted bounds of lanes; one that two lanes share, in either direction, counts once."""
+def painted(bounds: Iterable[Doubles]) -> list[tuple[Doubles, MarkType]]:
+    """Return painted bounds of lanes as marks; one that two lanes share, in either direction, counts once."""
     found: dict[bytes, Doubles] = {}
     for bound in bounds:
         if len(bound) and bound[::-1].tobytes() not in found:
             found.setdefault(bound.tobytes(), bound)
-    return list(found.values())
+    return [(bound, MarkType.ROAD_LINE) for bound in found.values()]
 
 
 def evenly(line: Doubles, count: int) -> Doubles:
-    """[count, 2] points at equal arc length along a line [P, 2]."""
+    """Return [count, 2] points at equal arc length along a line [P, 2]."""
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     where = np.linspace(0, along[-1], count)
     return np.stack([np.interp(where, along, line[:, k]) for k in range(2)], axis=-1)
 
 
 def matched(left: Doubles, right: Doubles, field: str) -> tuple[Doubles, Doubles]:
-    """Both bounds of a lane with as many points, evenly and at most :data:`SPACING` apart."""
+    """Return both bounds of a lane with as many points, evenly and at most :data:`SPACING` apart."""
     longest = max(np.hypot(*np.diff(line, axis=0).T).sum() for line in (left, right))
-    if not longest <= MAX_BOUND:
-        raise DataError(f"a lane of {longest:.4g} m, at most {MAX_BOUND:g}", field=field)
+    refuse(not longest <= MAX_BOUND, f"a lane of {longest:.4g} m, at most {MAX_BOUND:g}", field)
     count = max(int(np.ceil(longest / SPACING)) + 1, 2)
     return evenly(left, count), evenly(right, count)
 
 
 def median_width(left: Doubles, right: Doubles) -> float:
-    """Metres between two bounds with as many points."""
+    """Return the metres between two bounds with as many points."""
     return float(np.median(np.hypot(*(left - right).T)))
 
 
 def drivable_rings(
     outlines: Sequence[Doubles | shapely.Polygon], field: str = "lanelet"
 ) -> tuple[Doubles, ...]:
-    """Closed rings [P, 2] around the union of outlines or polygons, inside on the left; holes run the other way.
+    """Return closed rings [P, 2] around the union of outlines, inside on the left; holes run the other way.
 
     Slits and holes up to 2 * :data:`SLIT` wide are closed. A :class:`DataError` says of which ``field`` the union
     can't be formed, or would be beyond all measure.
     """
-    _check_effort([ring for outline in outlines for ring in _rings_of(outline)], field)
+    shapes = [outline for outline in outlines if isinstance(outline, shapely.Polygon)]
+    flat = [outline[:, :2] for outline in outlines if not isinstance(outline, shapely.Polygon)]
+    _check_effort([*flat, *_rings(shapes)], field)
     try:
         # Shapely takes NaN and infinity on its way through outlines of no width for something to warn of.
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            polygons = np.array([shapely.Polygon(outline) for outline in outlines], object)
-            union = shapely.union_all(shapely.make_valid(polygons))
+            union = shapely.union_all(
+                shapely.make_valid(np.array([shapely.Polygon(each) for each in outlines], object))
+            )
             wider = union.buffer(SLIT, join_style="mitre")
             closed = wider.buffer(-SLIT, join_style="mitre").simplify(0.01)
     except (shapely.errors.ShapelyError, ValueError) as error:
         raise DataError(f"the union of the areas can't be formed: {error}", field=field) from error
-    rings = []
-    for part in shapely.get_parts(closed):
-        if part.geom_type == "Polygon" and not part.is_empty:
-            polygon = orient(part, 1.0)
-            rings += [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
-    return tuple(rings)
+    parts = [part for part in shapely.get_parts(closed) if part.geom_type == "Polygon" and not part.is_empty]
+    return tuple(_rings(orient(part, 1.0) for part in parts))
 
 
-def _rings_of(outline: Doubles | shapely.Polygon) -> list[Doubles]:
-    """An outline itself, or the rings [P, 2] of a polygon."""
-    if isinstance(outline, shapely.Polygon):
-        return [np.asarray(ring.coords)[:, :2] for ring in (outline.exterior, *outline.interiors)]
-    return [outline[:, :2]]
+def _rings(polygons: Iterable[shapely.Polygon]) -> list[Doubles]:
+    rings = (ring for polygon in polygons for ring in (polygon.exterior, *polygon.interiors))
+    return [np.asarray(ring.coords)[:, :2] for ring in rings]
 
 
 def _check_effort(outlines: Sequence[Doubles], field: str) -> None:
     """Refuse outlines that are too many, or cross each other or themselves without end."""
     count = sum(map(len, outlines))
-    if count > MAX_EDGES:
-        raise DataError(f"outlines of {count} points, at most {MAX_EDGES}", field=field)
+    refuse(count > MAX_EDGES, f"outlines of {count} points, at most {MAX_EDGES}", field)
     if count == 0:
         return
     owner = np.repeat(np.arange(len(outlines)), [len(outline) for outline in outlines])
-    first = np.concatenate(outlines)
-    second = np.concatenate([np.roll(outline, -1, axis=0) for outline in outlines])
-    edges = shapely.linestrings(np.stack([first, second], axis=1))
+    ends = [np.concatenate([np.roll(outline, k, axis=0) for outline in outlines]) for k in (0, -1)]
+    edges = shapely.linestrings(np.stack(ends, axis=1))
     tree = shapely.STRtree(edges)
     probes = edges[np.linspace(0, count - 1, PROBES).astype(np.int64)]
     near = tree.query(probes).shape[1] / PROBES * count
-    if near > MAX_NEAR:
-        raise DataError(f"outlines whose edges meet about {near:.2g} times", field=field)
+    refuse(near > MAX_NEAR, f"outlines whose edges meet about {near:.2g} times", field)
     one, other = tree.query(edges, predicate="crosses")
     crossings, knots = len(one) // 2, int((owner[one] == owner[other]).sum()) // 2
-    if crossings > MAX_CROSSINGS or knots > MAX_KNOTS:
-        message = f"outlines that cross {crossings} times, themselves {knots} times"
-        raise DataError(f"{message}, at most {MAX_CROSSINGS} and {MAX_KNOTS}", field=field)
+    many = crossings > MAX_CROSSINGS or knots > MAX_KNOTS
+    refuse(many, f"outlines that cross {crossings} times, themselves {knots} times", field)
 
 
-def stretches(ring: Doubles, keep: NDArray[np.bool_]) -> list[Doubles]:
-    """What remains of a closed ring [P, 2] when only some of its P - 1 edges are kept, in the same direction."""
+def stretches(ring: Doubles, keep: Bools) -> list[Doubles]:
+    """Return what remains of a closed ring [P, 2] when only some of its P - 1 edges are kept, same direction."""
     if keep.all():
         return [ring]
-    if not keep.any():
-        return []
     # The ring is cut open at an edge that goes, so that no stretch runs past the end of the array.
     shift = int(np.argmin(keep)) + 1
-    keep = np.roll(keep, -shift)
     points = np.roll(ring[:-1], -shift, axis=0)
-    padded = np.concatenate([[False], keep, [False]])
-    first, last = np.flatnonzero(~padded[:-1] & padded[1:]), np.flatnonzero(padded[:-1] & ~padded[1:])
+    change = np.diff(np.pad(np.roll(keep, -shift), 1).astype(np.int8))
+    first, last = np.flatnonzero(change > 0), np.flatnonzero(change < 0)
     return [points[a : b + 1] for a, b in zip(first, last, strict=True)]
 
 
 def cut_ends(bounds: Sequence[tuple[Doubles, Doubles]], links: Links) -> Doubles:
-    """[N, 2, 2] the line across each lane's end or start where no other lane goes on: there a map was cut.
+    """Return [N, 2, 2] the line across each lane's end or start where no other lane goes on: there a map was cut.
 
-    Of each lane left and right bound [P, 2], in the direction of travel; of all the successors.
+    Takes left and right bound [P, 2] of each lane, in the direction of travel, and all the successors.
     """
     goes, comes = set(links[:, 0].tolist()), set(links[:, 1].tolist())
     found = [(left[-1], right[-1]) for k, (left, right) in enumerate(bounds) if k not in goes]
@@ -238,8 +220,8 @@ def cut_ends(bounds: Sequence[tuple[Doubles, Doubles]], links: Links) -> Doubles
     return np.array(found, np.float64).reshape(-1, 2, 2)
 
 
-def opened(rings: Sequence[Doubles], cuts: Doubles) -> tuple[Doubles, ...]:
-    """Closed rings [P, 2] without their edges along cuts [N, 2, 2], in the same direction.
+def opened(rings: Sequence[Doubles], cuts: Doubles) -> list[Doubles]:
+    """Return closed rings [P, 2] without their edges along cuts [N, 2, 2], in the same direction.
 
     Traffic goes on beyond a cut, so that as road boundary it would put all of it off the road.
     """
@@ -249,11 +231,11 @@ def opened(rings: Sequence[Doubles], cuts: Doubles) -> tuple[Doubles, ...]:
     for ring in rings:
         near = tree.query(shapely.LineString(ring), predicate="dwithin", distance=CUT)
         found += stretches(*_marked(ring, cuts[near], lines[near])) if len(near) else [ring]
-    return tuple(found)
+    return found
 
 
-def _marked(ring: Doubles, cuts: Doubles, lines: NDArray[np.object_]) -> tuple[Doubles, NDArray[np.bool_]]:
-    """The ring with a vertex where each cut begins and ends, and which of its edges lie along none."""
+def _marked(ring: Doubles, cuts: Doubles, lines: NDArray[np.object_]) -> tuple[Doubles, Bools]:
+    """Return the ring with a vertex where each cut begins and ends, and which of its edges lie along none."""
     shape = shapely.LineString(ring)
     corners = shapely.points(cuts.reshape(-1, 2))
     corners = corners[shapely.distance(shape, corners) <= CUT]
@@ -264,9 +246,7 @@ def _marked(ring: Doubles, cuts: Doubles, lines: NDArray[np.object_]) -> tuple[D
     along = np.unique(np.concatenate([own, new]))
     points = np.stack([np.interp(along, own, ring[:, k]) for k in range(2)], axis=-1)
     step = np.diff(points, axis=0)
-    middle = shapely.points(points[:-1] + step / 2)
     across = cuts[:, 1] - cuts[:, 0]
-    close = shapely.distance(middle[:, None], lines) <= CUT
-    lengths = np.hypot(*step.T)[:, None] * np.hypot(*across.T)
-    close &= np.abs(step @ across.T) >= 0.7 * lengths
+    close = shapely.distance(shapely.points(points[:-1] + step / 2)[:, None], lines) <= CUT
+    close &= np.abs(step @ across.T) >= 0.7 * np.hypot(*step.T)[:, None] * np.hypot(*across.T)
     return points, ~close.any(axis=1)

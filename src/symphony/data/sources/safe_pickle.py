@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.sources.base import read_whole, refuse
 from symphony.errors import DataError
 
-MAX_BYTES = 1 << 28
-"""Bytes of a file; scenarios have a few million."""
-MAX_OPCODES = 20_000_000
-"""Instructions of a file; scenarios have a few million."""
+MAX_BYTES = 1 << 28  # bytes of a file; scenarios have a few million
+MAX_OPCODES = 20_000_000  # instructions of a file; scenarios have a few million
 
 _PLAIN = (
     "PROTO FRAME STOP MARK POP POP_MARK NONE NEWTRUE NEWFALSE LONG1 LONG4 BININT BININT1 BININT2 BINFLOAT BINBYTES "
@@ -32,11 +31,9 @@ _PLAIN = (
     "EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_DICT SETITEM SETITEMS EMPTY_SET ADDITEMS FROZENSET MEMOIZE BINGET "
     "LONG_BINGET STACK_GLOBAL REDUCE BUILD"
 )
-_OPCODES = frozenset(_PLAIN.split())
-"""Instructions of protocols 4 and 5 that plain data needs."""
+_OPCODES = frozenset(_PLAIN.split())  # instructions of protocols 4 and 5 that plain data needs
 _KINDS = "biufSU"
-MAX_ITEM = 4096
-"""Bytes of one element of an array: texts of up to 1024 characters."""
+MAX_ITEM = 4096  # bytes of one element of an array: texts of up to 1024 characters
 
 
 class _Named:
@@ -51,7 +48,7 @@ class _Named:
         return self._function(*arguments)
 
     def __setstate__(self, state: Any) -> None:
-        raise pickle.UnpicklingError("sets the state of what has none")
+        raise DataError("sets the state of what has none")
 
 
 class _Type:
@@ -60,17 +57,17 @@ class _Type:
     __slots__ = ("found",)
 
     def __init__(self, text: Any, *flags: Any) -> None:
-        if not isinstance(text, str) or not 2 <= len(text) <= 6 or text[0] not in _KINDS:
-            raise pickle.UnpicklingError(f"an array of type {str(text)[:20]!r}")
+        plain = isinstance(text, str) and 2 <= len(text) <= 6 and text[0] in _KINDS
+        refuse(not plain, f"an array of type {str(text)[:20]!r}")
         self.found = np.dtype(text)
-        if self.found.kind not in _KINDS or not 0 < self.found.itemsize <= MAX_ITEM:
-            raise pickle.UnpicklingError(f"an array of type {text!r}")
+        plain = self.found.kind in _KINDS and 0 < self.found.itemsize <= MAX_ITEM
+        refuse(not plain, f"an array of type {text!r}")
 
     def __setstate__(self, state: Any) -> None:
         order = state[1] if isinstance(state, tuple) and len(state) > 1 else None
         # For plain types nothing but the order is ever given.
-        if order not in {"<", ">", "|", "="} or any(part is not None for part in state[2:5]):
-            raise pickle.UnpicklingError("an array of a structured type")
+        plain = order in {"<", ">", "|", "="} and all(part is None for part in state[2:5])
+        refuse(not plain, "an array of a structured type")
         self.found = self.found.newbyteorder(order)
 
 
@@ -79,31 +76,24 @@ class Array:
 
     __slots__ = ("value",)
 
-    def __init__(self) -> None:
-        self.value: NDArray[Any] = np.zeros(0)
+    def __init__(self, *state: Any) -> None:
+        self.value: NDArray[Any] = _array(*state) if state else np.zeros(0)
 
     def __setstate__(self, state: Any) -> None:
         _, shape, dtype, fortran, data = state
         self.value = _array(data, dtype, shape, "F" if fortran else "C")
 
 
-def _array(data: Any, dtype: Any, shape: Any, order: str) -> NDArray[Any]:
-    if not isinstance(dtype, _Type) or not isinstance(data, (bytes, bytearray)):
-        raise pickle.UnpicklingError("an array of objects")
+def _array(data: Any, dtype: Any, shape: Any, order: Any) -> NDArray[Any]:
+    known = isinstance(dtype, _Type) and isinstance(data, (bytes, bytearray))
+    refuse(not known, "an array of objects")
     # Otherwise the product of many sizes could be anything.
-    if not isinstance(shape, tuple) or len(shape) > 8:
-        raise pickle.UnpicklingError("an array without a shape")
-    if not all(type(side) is int and 0 <= side <= MAX_BYTES for side in shape):
-        raise pickle.UnpicklingError("an array of an impossible shape")
-    if math.prod(shape) * dtype.found.itemsize != len(data):
-        raise pickle.UnpicklingError(f"an array of shape {shape} in {len(data)} bytes")
+    refuse(not isinstance(shape, tuple) or len(shape) > 8, "an array without a shape")
+    sides = [type(side) is int and 0 <= side <= MAX_BYTES for side in shape]
+    refuse(not all(sides), "an array of an impossible shape")
+    size = math.prod(shape) * dtype.found.itemsize
+    refuse(size != len(data), f"an array of shape {shape} in {len(data)} bytes")
     return np.frombuffer(data, dtype.found).reshape(shape, order="F" if order == "F" else "C")
-
-
-def _from_buffer(data: Any, dtype: Any, shape: Any, order: Any) -> Array:
-    found = Array()
-    found.value = _array(data, dtype, shape, order)
-    return found
 
 
 def _scalar(dtype: Any, data: Any) -> Any:
@@ -111,25 +101,24 @@ def _scalar(dtype: Any, data: Any) -> Any:
 
 
 def _never(*_: Any) -> Any:
-    raise pickle.UnpicklingError("makes an array by itself")
+    raise DataError("makes an array by itself")
 
 
-_NUMPY = {"_reconstruct": lambda *_: Array(), "scalar": _scalar}
 _NAMES: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): _Named(_never),
     ("numpy", "dtype"): _Named(_Type),
-    **{(f"numpy.{core}.multiarray", n): _Named(f) for core in ("core", "_core") for n, f in _NUMPY.items()},
-    **{(f"numpy.{core}.numeric", "_frombuffer"): _Named(_from_buffer) for core in ("core", "_core")},
 }
+for _core in ("core", "_core"):
+    _NAMES[f"numpy.{_core}.multiarray", "_reconstruct"] = _Named(lambda *_: Array())
+    _NAMES[f"numpy.{_core}.multiarray", "scalar"] = _Named(_scalar)
+    _NAMES[f"numpy.{_core}.numeric", "_frombuffer"] = _Named(Array)
 
 
 class _Plain(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        """One of a few names, none of which is what it says."""
-        try:
-            return _NAMES[module, name]
-        except KeyError:
-            raise pickle.UnpicklingError(f"refers to {module}.{name}, which no plain data needs") from None
+        """Return one of a few names, none of which is what it says."""
+        refuse((module, name) not in _NAMES, f"refers to {module}.{name}, which no plain data needs")
+        return _NAMES[module, name]
 
 
 def load_plain(path: Path) -> Any:
@@ -137,12 +126,7 @@ def load_plain(path: Path) -> Any:
 
     A :class:`DataError` names what is too large, empty, cut short, damaged, or anything else that it refers to.
     """
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise DataError(f"{size} bytes, at most {MAX_BYTES} can be read", file=path)
-    data = path.read_bytes()
-    if not data:
-        raise DataError("the file is empty", file=path)
+    data = read_whole(path, MAX_BYTES)
     try:
         _check(data)
         return _Plain(io.BytesIO(data)).load()
@@ -155,11 +139,9 @@ def _check(data: bytes) -> None:
     count = 0
     for count, (opcode, argument, place) in enumerate(pickletools.genops(data), start=1):
         if opcode.name == "PROTO" and (argument or 0) < 4:
-            raise pickle.UnpicklingError(f"protocol {argument}; 4 and 5 are read")
+            raise DataError(f"protocol {argument}; 4 and 5 are read")
         if opcode.name not in _OPCODES:
-            message = f"instruction {opcode.name} at byte {place}, which no plain data needs"
-            raise pickle.UnpicklingError(message)
+            raise DataError(f"instruction {opcode.name} at byte {place}, which no plain data needs")
         if count > MAX_OPCODES:
-            raise pickle.UnpicklingError(f"more than {MAX_OPCODES} instructions")
-    if count == 0:
-        raise pickle.UnpicklingError("no instructions")
+            raise DataError(f"more than {MAX_OPCODES} instructions")
+    refuse(count == 0, "no instructions")

@@ -2,24 +2,17 @@
 
 Pickles can do anything; these are read by :mod:`.safe_pickle`, which admits plain containers and arrays only.
 
-How the format maps onto :class:`~symphony.data.segment.RunSegment`:
-
-- ``segment_id`` is the scenario's ``id``. ``group`` is dataset, map and date or log where the file has them (scenes
-  of one nuScenes drive share them, scenarios of one nuPlan log), else the id.
-- The ego is the recording vehicle (``sdc_id``). Agents are in file order; their ids are the track's names if all are
-  numbers, else their place in the file, as the ego's is. Tracks that are valid at no step are left out.
+- ``group`` is dataset, map and date or log where the file has them (scenes of one nuScenes drive share them), else
+  the id. The ego is the recording vehicle (``sdc_id``). Agents are in file order; their ids are the track's names if
+  all are numbers, else their place in the file.
 - A box size is the median over the valid states. An ego wider than long (ScenarioNet swaps the two for nuScenes) is
-  turned. The position of nuScenes' ego is that of its rear axle, as logged. Cones, barriers and other things are of
-  type OTHER.
-- Velocities of nuScenes are differences to the next position; at the last state of a track, where ScenarioNet writes
-  0, that of the state before is taken.
-- Coordinates are taken relative to the ego's first position, rounded to metres, z as logged; maps of nuScenes have
-  none.
+  turned. The position of nuScenes' ego is that of its rear axle, as logged. Velocities of nuScenes are differences to
+  the next position; at the last state of a track, where ScenarioNet writes 0, that of the state before is taken.
+- Coordinates are relative to the ego's first position, rounded to metres, z as logged; maps of nuScenes have none.
 - Successors and neighbours are the source's, or derived from the geometry where it has none (nuScenes): see
-  :func:`.scenarionet_map.successors` and :func:`.scenarionet_map.neighbors`.
-- The boundary is the road edges, or goes round the union of the drivable areas (``boundary_…``, if all are closed)
-  and the lanes' areas, open where no lane goes on. nuScenes and Argoverse 2 have no speed limits; the 100 km/h and
-  85 mph in their files are not taken.
+  :func:`_successors` and :func:`_neighbors`. The boundary is the road edges, or goes round the union of the drivable
+  areas (``boundary_…``, if all are closed) and the lanes' areas, open where no lane goes on. The speed limits of
+  nuScenes and Argoverse 2 are made up, and not taken.
 - A light is one row per lane, at the stop point logged, or where the lane begins: so, too, for nuPlan, for which
   ScenarioNet names a place 8 m further on.
 """
@@ -31,23 +24,36 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import shapely
 
 from symphony.data.bounds import MAX_STEPS, check_counts
-from symphony.data.resample import evened
-from symphony.data.segment import AgentType, Bools, RunSegment, SignalState
-from symphony.data.sources.base import Item, Reader, time_step, to_float32
-from symphony.data.sources.lines import Doubles, Lane, lights
+from symphony.data.resample import evened, wrap
+from symphony.data.segment import (
+    AgentType,
+    Bools,
+    Floats,
+    LaneType,
+    MarkType,
+    RoadMap,
+    RunSegment,
+    SignalState,
+)
+from symphony.data.sources import base, lines
+from symphony.data.sources.base import Doubles, Item, Reader, located, motion, refuse
+from symphony.data.sources.lines import Lane, Links
 from symphony.data.sources.safe_pickle import Array, load_plain
-from symphony.data.sources.scenarionet_map import mapping, points, read_map
 from symphony.errors import DataError
 
-_TYPES = {
-    "VEHICLE": AgentType.VEHICLE,
-    "PEDESTRIAN": AgentType.PEDESTRIAN,
-    "CYCLIST": AgentType.CYCLIST,
-    "UNSET": AgentType.UNSET,
-}
+MAX_COORDINATE = 1e8  # larger magnitudes are no metres of a city
+MEETS = 0.5  # metres within which a lane's end meets another's start
+TURN = np.deg2rad(60)  # largest angle between the two there
+HALF_WIDTH = 1.75  # metres on either side of a centre line that are drivable where the map has no area
+MAX_WIDTH = 20.0  # metres on either side of a line in which the edge of its area is looked for
+BESIDE = (2.0, 5.5)  # metres between the centre lines of neighbours
+
+_STATE = {"valid": 1, "position": 3, "heading": 1, "velocity": 2, "length": 1, "width": 1, "height": 1}
+"""Entries of a track's state, and how many numbers each has at a step."""
+_TYPES = {kind.name: kind for kind in AgentType}
 _LIGHTS = {f"LANE_STATE_{state.name}": state for state in SignalState} | {
     "TRAFFIC_LIGHT_GREEN": SignalState.GO,
     "TRAFFIC_LIGHT_YELLOW": SignalState.CAUTION,
@@ -55,6 +61,16 @@ _LIGHTS = {f"LANE_STATE_{state.name}": state for state in SignalState} | {
     "TRAFFIC_LIGHT_UNKNOWN": SignalState.UNKNOWN,
     "None": SignalState.UNKNOWN,
 }
+_LANES = {
+    "LANE_SURFACE_STREET": LaneType.SURFACE_STREET,
+    "LANE_SURFACE_UNSTRUCTURE": LaneType.SURFACE_STREET,
+    "LANE_UNKNOWN": LaneType.UNDEFINED,
+    "LANE_FREEWAY": LaneType.FREEWAY,
+    "LANE_BIKE_LANE": LaneType.BIKE_LANE,
+}
+_AREAS = {kind.name: kind for kind in (MarkType.CROSSWALK, MarkType.SPEED_BUMP, MarkType.DRIVEWAY)}
+_NO_LIMITS = frozenset({"nuscenes", "av2"})
+"""Datasets without speed limits: ScenarioNet writes 100 km/h for connectors, and 85 mph for all lanes."""
 
 
 class ScenarioNetReader(Reader):
@@ -64,37 +80,34 @@ class ScenarioNetReader(Reader):
     patterns = ("sd_*.pkl", "[0-9]*.pkl")
 
     def _read(self, path: Path) -> Iterator[Item]:
-        scenario = mapping(load_plain(path), "the file")
-        name = scenario.get("id")
+        scenario = load_plain(path)
+        name = scenario.get("id") if isinstance(scenario, dict) else None
         if not isinstance(name, str) or not name:
             raise DataError("missing; is this a ScenarioNet scenario?", field="id")
-        try:
-            # Absurd numbers may overflow on the way: the result is not finite, which validation reports.
-            with np.errstate(over="ignore", invalid="ignore"):
-                yield _segment(scenario, name, path.name)
-        except DataError as error:
-            raise error.at(segment=name[:200]) from error
+        with located(segment=name[:200]):
+            yield _segment(scenario, name, path.name)
 
 
 def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
-    metadata = mapping(scenario.get("metadata"), "metadata")
-    times = _numbers(metadata.get("ts"), "metadata: ts", 1)[:, 0]
-    steps = len(times)
-    if scenario.get("length") != steps or not 2 <= steps <= MAX_STEPS:
-        raise DataError(f"{steps} for {str(scenario.get('length'))[:20]} steps", field="metadata: ts")
-    dt = time_step(times, "metadata: ts")
-    names, kinds, states, valid = _tracks(mapping(scenario.get("tracks"), "tracks"), steps)
-    ego = metadata.get("sdc_id")
-    if not isinstance(ego, str) or ego not in names:
-        raise DataError("names no track that is valid at some step", field="metadata: sdc_id")
+    with located(field="metadata"):
+        metadata = scenario["metadata"]
+        times = np.asarray(metadata["ts"].value).astype(np.float64)
+        steps, ego, dataset = len(times), metadata["sdc_id"], str(metadata.get("dataset", ""))
+        place, date = metadata.get("map"), metadata.get("date", metadata.get("log_name"))
+        if times.ndim != 1 or scenario["length"] != steps or not 2 <= steps <= MAX_STEPS:
+            raise DataError(f"{times.shape} times for {str(scenario['length'])[:20]} steps")
+        dt = base.time_step(times, "metadata: ts")
+    names, kinds, states, valid = _tracks(scenario, steps)
+    refuse(ego not in names, "names no track that is valid at some step", "metadata: sdc_id")
     row = names.index(ego)
     origin = np.round(states[row, np.argmax(valid[row]), :3])
     origin[2] = 0
-    dataset = str(metadata.get("dataset", ""))
-    road, lanes = read_map(mapping(scenario.get("map_features"), "map_features"), dataset, origin)
+    road, lanes = _map(scenario, dataset, origin)
     found = _signals(scenario.get("dynamic_map_states") or {}, lanes, steps, dataset)
     if dataset == "nuscenes":
-        _carry_velocity(states[..., 4:6], valid)
+        # The last of consecutive valid states gets the velocity of the one before.
+        last = valid[:, 1:] & valid[:, :-1] & ~np.pad(valid[:, 2:], ((0, 0), (0, 1)))
+        states[:, 1:, 4:6][last] = states[:, :-1, 4:6][last]
     numeric = all(each.isdecimal() and len(each) < 18 for each in names)
     segment = RunSegment(
         segment_id=name.replace("/", "_"),
@@ -104,100 +117,260 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
         agent_id=np.array([int(each) for each in names] if numeric else range(len(names)), np.int64),
         agent_type=np.array(kinds, np.uint8),
         size=_sizes(states[..., 6:], valid, row),
-        position=to_float32(np.where(valid[..., None], states[..., :3] - origin, 0.0)),
-        heading=to_float32(states[..., 3]),
-        velocity=to_float32(states[..., 4:6]),
-        valid=valid,
+        **motion(states[..., :3] - origin, states[..., 3], states[..., 4:6], valid),
         road=road,
-        **lights(found, steps, origin),
+        **lines.lights(found, steps, origin),
         origin=origin,
         file=file,
-        group=_group(metadata, dataset),
+        group=f"{dataset} {place} {date}" if isinstance(place, str) and isinstance(date, str) else "",
     )
     return evened(segment, times)
 
 
-def _group(metadata: Mapping[Any, Any], dataset: str) -> str:
-    place, date = metadata.get("map"), metadata.get("date", metadata.get("log_name"))
-    return f"{dataset} {place} {date}" if isinstance(place, str) and isinstance(date, str) else ""
+def _tracks(scenario: Mapping[Any, Any], steps: int) -> tuple[list[str], list[int], Doubles, Bools]:
+    """Return names [A], types [A], states [A, T, 9] and where they are valid [A, T], of tracks valid at some step."""
+    found: list[tuple[str, int, Doubles, Bools]] = []
+    with located(field="tracks"):
+        tracks = scenario["tracks"].items()
+        check_counts(len(tracks), steps, "tracks")
+    for key, track in tracks:
+        with located(field=f"tracks {str(key)[:60]}"):
+            parts = [np.asarray(track["state"][name].value, np.float64).reshape(steps, -1) for name in _STATE]
+            parts = [part[:, :width] for part, width in zip(parts, _STATE.values(), strict=True)]
+            valid = parts[0][:, 0] > 0
+            states = np.where(valid[:, None], np.concatenate(parts[1:], axis=1), 0.0)
+            refuse(states.shape[1] != 9, f"{states.shape[1]} numbers a step, expected 9")
+            if valid.any():
+                found.append((str(key), _TYPES.get(str(track.get("type")), AgentType.OTHER), states, valid))
+    refuse(not found, "has no agents", "tracks")
+    names, kinds, all_states, masks = zip(*found, strict=True)
+    return list(names), list(kinds), np.stack(all_states), np.stack(masks)
 
 
-_STATE = (("position", 3), ("heading", 1), ("velocity", 2), ("length", 1), ("width", 1), ("height", 1))
-
-
-def _tracks(tracks: Mapping[Any, Any], steps: int) -> tuple[list[str], list[int], Doubles, Bools]:
-    """(names [A], types [A], states [A, T, 9] with 0 where not valid, valid [A, T]) of those valid at some step."""
-    check_counts(len(tracks), steps, "tracks")
-    names: list[str] = []
-    kinds: list[int] = []
-    states: list[Doubles] = []
-    masks: list[Bools] = []
-    for key, value in tracks.items():
-        field = f"tracks {str(key)[:60]}"
-        track = mapping(value, field)
-        state = mapping(track.get("state"), f"{field}: state")
-        valid = _numbers(state.get("valid"), f"{field}: valid", 1)[:, 0] > 0
-        parts = [_numbers(state.get(name), f"{field}: {name}", width) for name, width in _STATE]
-        for (name, _), part in zip((("valid", 1), *_STATE), (valid, *parts), strict=True):
-            if len(part) != steps:
-                raise DataError(f"{len(part)} states for {steps} steps", field=f"{field}: {name}")
-        if valid.any():
-            names.append(str(key))
-            kinds.append(_TYPES.get(str(track.get("type")), AgentType.OTHER))
-            states.append(np.where(valid[:, None], np.concatenate(parts, axis=1), 0.0))
-            masks.append(valid)
-    if not names:
-        raise DataError("has no agents", field="tracks")
-    return names, kinds, np.stack(states), np.stack(masks)
-
-
-def _numbers(value: Any, field: str, width: int) -> Doubles:
-    """[N, width] of an array of numbers, [N] or [N, width or more]; a :class:`DataError` if it is none."""
-    found = value.value if isinstance(value, Array) else value
-    if not isinstance(found, np.ndarray) or found.dtype.kind not in "bfiu" or found.ndim not in {1, 2}:
-        raise DataError(f"expected an array of numbers, is {type(found).__name__}", field=field)
-    found = found.reshape(len(found), -1) if found.size else found.reshape(0, width)
-    if found.shape[1] < width:
-        raise DataError(f"{found.shape[1]} numbers a step, expected {width}", field=field)
-    return found[:, :width].astype(np.float64)
-
-
-def _sizes(sizes: Doubles, valid: Bools, ego: int) -> NDArray[np.float32]:
-    """[A, 3] from [A, T, 3]; the ego is at least as long as wide."""
+def _sizes(sizes: Doubles, valid: Bools, ego: int) -> Floats:
+    """Return [A, 3] from [A, T, 3]; the ego is at least as long as wide."""
     found = np.array([np.median(size[mask], axis=0) for size, mask in zip(sizes, valid, strict=True)])
     found[ego, :2] = np.sort(found[ego, :2])[::-1]
-    return to_float32(found)
-
-
-def _carry_velocity(velocity: Doubles, valid: Bools) -> None:
-    """Give the last of consecutive valid states the velocity [A, T, 2] of the one before."""
-    last = valid[:, 1:] & valid[:, :-1] & ~np.pad(valid[:, 2:], ((0, 0), (0, 1)))
-    velocity[:, 1:][last] = velocity[:, :-1][last]
+    return base.to_float32(found)
 
 
 def _signals(
     states: Any, lanes: Sequence[Lane], steps: int, dataset: str
 ) -> dict[int, tuple[Doubles, list[int]]]:
-    """Lane -> (stop point [3], state [T])."""
+    """Return lane -> (stop point [3], state [T])."""
     index = {lane.name: k for k, lane in enumerate(lanes)}
     found: dict[int, tuple[Doubles, list[int]]] = {}
-    for key, value in mapping(states, "dynamic_map_states").items():
-        field = f"dynamic_map_states {str(key)[:60]}"
-        light = mapping(value, field)
-        lane = index.get(str(light.get("lane", key)))
-        logged = mapping(light.get("state"), f"{field}: state").get("object_state")
-        logged = logged.value.tolist() if isinstance(logged, Array) else logged
-        if not isinstance(logged, list | tuple) or len(logged) != steps:
-            raise DataError(f"expected {steps} states", field=f"{field}: object_state")
-        unknown = [state for state in logged if str(state) not in _LIGHTS]
-        if unknown:
-            raise DataError(f"unknown value {str(unknown[0])[:40]!r}", field=f"{field}: object_state")
-        if lane is None or lane in found:
-            continue
-        stop = light.get("stop_point")
-        place = np.zeros((0, 3)) if stop is None else points([stop], f"{field}: stop_point")
-        # Zeros are what ScenarioNet begins with, for a point that is never named.
-        if not place.any() or dataset == "nuplan":
-            place = lanes[lane].line[:1]
-        found[lane] = np.pad(place[0], (0, 3 - place.shape[1])), [_LIGHTS[str(state)] for state in logged]
+    with located(field="dynamic_map_states"):
+        for key, light in states.items():
+            lane = index.get(str(light.get("lane", key)))
+            logged = light["state"]["object_state"]
+            logged = [_LIGHTS[str(state)] for state in getattr(logged, "value", logged)]
+            if len(logged) != steps:
+                raise DataError(f"{len(logged)} states for {steps} steps", field=f"dynamic_map_states {key}")
+            if lane is None or lane in found:
+                continue
+            stop = light.get("stop_point")
+            place = np.zeros((0, 3)) if stop is None else _points([stop])
+            # Zeros are what ScenarioNet begins with, for a point that is never named.
+            if not place.any() or dataset == "nuplan":
+                place = lanes[lane].line[:1]
+            found[lane] = np.pad(place[0], (0, 3 - place.shape[1])), logged
+    return found
+
+
+def _map(scenario: Mapping[Any, Any], dataset: str, origin: Doubles) -> tuple[RoadMap, list[Lane]]:
+    """Return the map relative to an origin [3], and its lanes in the source's coordinates."""
+    lanes: list[Lane] = []
+    areas: list[Doubles | None] = []
+    edges: list[Doubles] = []
+    outlines: list[Doubles] = []
+    pieces: list[Doubles] = []
+    marks: list[tuple[Doubles, MarkType]] = []
+    told = False
+    with located(field="map_features"):
+        features = scenario["map_features"].items()
+    for key, node in features:
+        with located(field=f"map_features {str(key)[:60]}"):
+            kind, line, area = (
+                str(node.get("type")),
+                *(_points(node.get(n, ())) for n in ("polyline", "polygon")),
+            )
+            if dataset == "nuscenes":
+                line = line[:, :2]  # the third number is a heading
+            if kind in _LANES and len(line):
+                told |= node.get("exit_lanes") is not None
+                areas.append(area[:, :2] if len(area) > 2 else None)
+                lanes.append(_lane(str(key), node, line, areas[-1], dataset))
+            elif kind.startswith("ROAD_EDGE") and len(line) > 1:
+                edges.append(line)
+            elif kind in _AREAS and len(area if len(area) else line) > 2:
+                ring = area if len(area) else line
+                marks.append((np.concatenate([ring, ring[:1]]), _AREAS[kind]))
+            elif kind == "STOP_SIGN":
+                marks.append((_points([node.get("position", ())]), MarkType.STOP_SIGN))
+            elif str(key).startswith("boundary_") and len(line) > 1:
+                closed = len(line) > 3 and bool((np.abs(line[0] - line[-1]) < 0.01).all())
+                (outlines if closed else pieces).append(line[:, :2])
+            elif kind.startswith("ROAD_LINE") and len(line) > 1:
+                marks.append((line, MarkType.ROAD_LINE))
+    refuse(not lanes, "has no lanes", "map_features")
+    if pieces:
+        # Long rings were cut up (Argoverse 2): without them, the islands that are whole would be all the road.
+        marks += [(line, MarkType.ROAD_LINE) for line in outlines + pieces]
+        outlines = []
+    links = [(a, b) for a, b in lines.named(lanes, "successors") if a != b] if told else _successors(lanes)
+    beside = None if any(lane.left or lane.right for lane in lanes) else _neighbors(lanes, areas)
+    flow = base.pairs(links)
+    edges = edges or lines.opened(_rings(lanes, areas, outlines), _cuts(lanes, flow))
+    numbers = range(len(lanes))
+    return lines.road_map(lanes, origin, edges, marks, links=flow, beside=beside, ids=numbers), lanes
+
+
+def _lane(name: str, node: Mapping[Any, Any], line: Doubles, area: Doubles | None, dataset: str) -> Lane:
+    limit = node.get("speed_limit_kmh")
+    known = isinstance(limit, int | float) and 0 < limit < 300 and dataset not in _NO_LIMITS
+    # Of nuPlan, ScenarioNet names all lanes of a road, in an order that need not be theirs.
+    left, right = (
+        () if dataset == "nuplan" else _references(node.get(f"{side}_neighbor")) for side in ("left", "right")
+    )
+    return Lane(
+        name=name,
+        line=line,
+        kind=_LANES[str(node["type"])],
+        width=_width(line, area),
+        speed_limit=float(limit) / 3.6 if known and limit is not None else np.nan,
+        successors=_references(node.get("exit_lanes")),
+        left=left,
+        right=right,
+    )
+
+
+def _references(values: Any) -> tuple[str, ...]:
+    if isinstance(values, Array):
+        values = values.value.ravel().tolist()
+    if not isinstance(values, list | tuple):
+        return ()
+    return tuple(str(v.get("feature_id")) if isinstance(v, dict) else str(v) for v in values)
+
+
+def _successors(lanes: Sequence[Lane]) -> list[tuple[int, int]]:
+    """Return which lanes go on where: one that begins within :data:`MEETS` of another's end, and turns off by less
+    than :data:`TURN`, succeeds it."""
+    starts, ends = (shapely.points(np.array([lane.line[row, :2] for lane in lanes])) for row in (0, -1))
+    before, after = shapely.STRtree(starts).query(ends, predicate="dwithin", distance=MEETS)
+    out, into = (np.array([_course(lane.line, row) for lane in lanes]) for row in (-1, 0))
+    good = (np.abs(wrap(into[after] - out[before])) < TURN) & (before != after)
+    return list(zip(before[good].tolist(), after[good].tolist(), strict=True))
+
+
+def _course(line: Doubles, row: int) -> float:
+    """Return the direction of the first or last piece; NaN, which is near no angle, of a single point."""
+    step = np.diff(line[:, :2], axis=0)
+    step = step[np.hypot(*step.T) > 1e-6]
+    return float(np.arctan2(*step[row][::-1])) if len(step) else np.nan
+
+
+def _neighbors(lanes: Sequence[Lane], areas: Sequence[Doubles | None]) -> tuple[Links, Links]:
+    """Return left and right neighbours: lanes whose areas touch and whose lines lie side by side."""
+    flat = [k for k, area in enumerate(areas) if area is not None and len(lanes[k].line) > 1]
+    shapes = shapely.make_valid(np.array([shapely.Polygon(areas[k]) for k in flat]))
+    one, two = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=0.2)
+    found: list[tuple[int, int]] = []
+    for a, b in ((flat[i], flat[j]) for i, j in zip(one.tolist(), two.tolist(), strict=True) if i < j):
+        side = _side(lanes[a].line, lanes[b].line)
+        if side:
+            found.append((a, b) if side > 0 else (b, a))
+    return base.pairs(found), base.pairs([(b, a) for a, b in found])
+
+
+def _side(one: Doubles, two: Doubles) -> int:
+    """Return 1 if the second line runs along on the left of the first, -1 on its right, else 0.
+
+    At the middle of the shorter one they must be :data:`BESIDE` apart and run the same way.
+    """
+    both = [shapely.LineString(line[:, :2]) for line in (one, two)]
+    short, long = sorted(both, key=lambda line: line.length)
+    if short.length < 1:
+        return 0
+    half = short.length / 2
+    spot = short.interpolate(half)
+    there = long.project(spot)
+    if not BESIDE[0] <= spot.distance(long) <= BESIDE[1] or not 0.5 < there < long.length - 0.5:
+        return 0
+    pieces = [
+        np.array([line.interpolate(at + d).coords[0] for d in (-0.5, 0.5)])
+        for line, at in ((short, half), (long, there))
+    ]
+    along, onward = (piece[1] - piece[0] for piece in pieces)
+    across = pieces[1].mean(axis=0) - pieces[0].mean(axis=0)
+    if along @ onward < np.cos(TURN / 2) * np.hypot(*along) * np.hypot(*onward):
+        return 0
+    turn = 1 if along[0] * across[1] - along[1] * across[0] > 0 else -1
+    return turn if short is both[0] else -turn
+
+
+def _width(line: Doubles, outline: Doubles | None) -> float:
+    """Return the metres of the area across the middle of the line; NaN where there is no area there."""
+    if outline is None or len(line) < 2:
+        return np.nan
+    shape = shapely.LineString(line[:, :2])
+    half = shape.length / 2
+    if half < 0.1:
+        return np.nan
+    before, middle, after = (np.array(shape.interpolate(half + d).coords[0]) for d in (-0.1, 0, 0.1))
+    along = (after - before) / np.hypot(*(after - before))
+    aside = MAX_WIDTH * np.array([-along[1], along[0]])
+    area = shapely.make_valid(shapely.Polygon(outline))
+    parts = shapely.get_parts(area.intersection(shapely.LineString([middle - aside, middle + aside])))
+    here = [part.length for part in parts if part.distance(shapely.Point(middle)) < 0.1]
+    return float(max(here, default=np.nan))
+
+
+def _rings(
+    lanes: Sequence[Lane], areas: Sequence[Doubles | None], outlines: Sequence[Doubles]
+) -> tuple[Doubles, ...]:
+    """Return rings around the outlined areas, where one inside another is a hole, and those of lanes.
+
+    Without outlines, lanes that have no area are :data:`HALF_WIDTH` wide on either side.
+    """
+    try:
+        area = shapely.Polygon()
+        for outline in outlines:
+            area = area.symmetric_difference(shapely.make_valid(shapely.Polygon(outline)))
+        if not outlines:
+            bare = [lane.line[:, :2] for lane, own in zip(lanes, areas, strict=True) if own is None]
+            strips = [shapely.LineString(line).buffer(HALF_WIDTH) for line in bare if len(line) > 1]
+            area = shapely.union_all(strips)
+    except shapely.errors.ShapelyError as error:
+        raise DataError(f"the union of the areas can't be formed: {error}", field="map_features") from error
+    parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
+    return lines.drivable_rings([*(own for own in areas if own is not None), *parts], field="map_features")
+
+
+def _cuts(lanes: Sequence[Lane], links: Links) -> Doubles:
+    """Return lines across the ends where no lane goes on, as wide as the lane and a little more."""
+    bounds = []
+    for lane in lanes:
+        half = lane.width / 2 if lane.width > 0 else HALF_WIDTH
+        courses = [_course(lane.line, row) for row in (0, -1)]
+        aside = (min(half, 4.0) + 1.0) * np.array([(-np.sin(course), np.cos(course)) for course in courses])
+        bounds.append((lane.line[[0, -1], :2] + aside, lane.line[[0, -1], :2] - aside))
+    cuts = lines.cut_ends(bounds, links)
+    return cuts[np.isfinite(cuts).all(axis=(1, 2))]
+
+
+def _points(value: Any) -> Doubles:
+    """Return [P, 2 or 3] points, however they are written; refuse what is none, or not finite."""
+    if isinstance(value, list | tuple):
+        rows = [row.value.tolist() if isinstance(row, Array) else row for row in value]
+        # Looked at one by one: lists in lists may be larger than any memory.
+        if not all(len(row) in {2, 3} and all(isinstance(n, int | float) for n in row) for row in rows):
+            raise DataError("not a list of points")
+        found = np.array(rows, np.float64)
+    else:
+        found = value.value.astype(np.float64)
+    if found.size == 0:
+        return np.zeros((0, 2))
+    refuse(found.ndim != 2 or found.shape[1] not in {2, 3}, f"shape {found.shape}, expected [points, 2 or 3]")
+    refuse(not (np.abs(found) <= MAX_COORDINATE).all(), "a coordinate that is not finite or absurdly large")
     return found

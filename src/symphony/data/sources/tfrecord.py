@@ -15,28 +15,26 @@ import google_crc32c
 
 from symphony.errors import DataError
 
-_HEADER = struct.Struct("<QI")
-_CHECK = struct.Struct("<I")
 MAX_RECORD = 32 << 20
 """Bytes of a record; a scenario has about one million, and takes many times as much once it is parsed."""
-_MASK_DELTA = 0xA282EAD8
+_HEADER, _CHECK = struct.Struct("<QI"), struct.Struct("<I")
 
 
 def masked_crc32c(data: bytes) -> int:
-    """CRC-32C rotated right by 15 bits plus a constant, so that a CRC of data holding CRCs stays sound."""
+    """Return the CRC-32C rotated right by 15 bits plus a constant: a CRC of data that holds CRCs stays sound."""
     crc = google_crc32c.value(data)
-    return (((crc >> 15) | (crc << 17)) + _MASK_DELTA) & 0xFFFFFFFF
+    return (((crc >> 15) | (crc << 17)) + 0xA282EAD8) & 0xFFFFFFFF
 
 
 def read_records(path: Path) -> Iterator[bytes | DataError]:
     """Yield the payload of each record; both checksums are verified.
 
-    A payload with a wrong checksum, or of more than :data:`MAX_RECORD` bytes, is yielded as a
-    :class:`DataError`, and reading goes on with the next record.
+    A payload with a wrong checksum, or of more than :data:`MAX_RECORD` bytes, is yielded as a :class:`DataError`,
+    and reading goes on with the next record.
 
     Raises:
-        DataError: the file is empty or cut short, or a length has a wrong checksum, so that there is no
-            telling where the next record begins.
+        DataError: the file is empty or cut short, or a length has a wrong checksum, so that there is no telling
+            where the next record begins.
         OSError: the file can't be opened or read.
     """
     with path.open("rb") as file:
@@ -53,24 +51,22 @@ def read_records(path: Path) -> Iterator[bytes | DataError]:
             length, check = _HEADER.unpack(header)
             if masked_crc32c(header[:8]) != check:
                 kind = "not a TFRecord file, or damaged" if index == 0 else "damaged"
-                message = f"{kind}: the checksum of the record's length is wrong"
-                raise DataError(message, file=path, field=where)
+                raise DataError(
+                    f"{kind}: the checksum of the record's length is wrong", file=path, field=where
+                )
             size = length + _CHECK.size
             left -= _HEADER.size + size
             if left < 0:
-                message = f"cut short: {left + size} of {size} payload bytes"
-                raise DataError(message, file=path, field=where)
+                raise DataError(f"cut short: {left + size} of {size} payload bytes", file=path, field=where)
             index += 1
             if length > MAX_RECORD:
                 file.seek(size, os.SEEK_CUR)
                 yield DataError(f"{length} bytes, at most {MAX_RECORD} are read", file=path, field=where)
                 continue
-            payload = file.read(length)
-            tail = file.read(_CHECK.size)
-            if masked_crc32c(payload) == int.from_bytes(tail, "little"):
-                yield payload
-            else:
-                yield DataError("damaged: the checksum of the payload is wrong", file=path, field=where)
+            payload, tail = file.read(length), file.read(_CHECK.size)
+            good = masked_crc32c(payload) == int.from_bytes(tail, "little")
+            message = "damaged: the checksum of the payload is wrong"
+            yield payload if good else DataError(message, file=path, field=where)
 
 
 def write_records(path: Path, payloads: Iterable[bytes]) -> None:

@@ -1,17 +1,13 @@
 """Reader of the Waymo Open Motion Dataset: ``Scenario`` records in TFRecord files.
 
-How the format maps onto :class:`~symphony.data.segment.RunSegment`:
-
-- ``segment_id`` is the scenario id; the ego is the recording vehicle (``sdc_track_index``).
-- Coordinates are taken relative to the ego's first valid position, rounded to metres, before they become
-  float32.
-- A box size is the one logged at ``current_time_index``, or the median over the valid states where the track
-  is not valid then. Tracks that are valid at no step are left out.
-- Lanes are centre lines without width. Road edges of either kind are the boundary; they come oriented with
-  the drivable side on the left. Polygons (crosswalks, speed bumps, driveways) become closed rings among the
-  marks.
-- Lanes without points and road edges of fewer than two are left out, as are references (exits, neighbours,
-  lights, objects of interest) to anything that is not in the record. Lanes of one point are kept.
+- ``segment_id`` is the scenario id; the ego is the recording vehicle (``sdc_track_index``). Coordinates are relative
+  to its first valid position, rounded to metres, before they become float32.
+- A box size is the one logged at ``current_time_index``, or the median over the valid states where the track is not
+  valid then. Tracks that are valid at no step are left out.
+- Road edges of either kind are the boundary; they come oriented with the drivable side on the left. Polygons become
+  closed rings among the marks.
+- Lanes without points and road edges of fewer than two are left out, as are references (exits, neighbours, lights,
+  objects of interest) to anything that is not in the record.
 - A light is one row per lane that has a state at any step; its stop point is the first one logged.
 """
 
@@ -29,10 +25,11 @@ from numpy.typing import NDArray
 
 from symphony.data.bounds import MAX_AGENTS, check_counts, check_signals
 from symphony.data.resample import evened
-from symphony.data.segment import AgentType, LaneType, MarkType, RunSegment, SignalState
+from symphony.data.segment import AgentType, Bools, LaneType, MarkType, RunSegment, SignalState
+from symphony.data.sources import base, lines
 from symphony.data.sources import womd_pb2 as pb
-from symphony.data.sources.base import Item, Reader, codes, time_step, to_float32, unexpected
-from symphony.data.sources.lines import Doubles, Lane, lights, road_map
+from symphony.data.sources.base import Doubles, Item, Reader, motion, refuse
+from symphony.data.sources.lines import Lane
 from symphony.data.sources.tfrecord import read_records
 from symphony.errors import DataError
 
@@ -40,10 +37,8 @@ MAX_FEATURES, MAX_LINKS = 100_000, 1_000_000
 """Entries of a map, and references between lanes or states of lights: far more than a scenario has."""
 MPS_PER_MPH = 0.44704
 
-_STATE = attrgetter(
-    *("center_x", "center_y", "center_z", "length", "width", "height"),
-    *("heading", "velocity_x", "velocity_y", "valid"),
-)
+_SIZE, _VELOCITY = ("length", "width", "height"), ("velocity_x", "velocity_y")
+_STATE = attrgetter("center_x", "center_y", "center_z", *_SIZE, "heading", *_VELOCITY, "valid")
 _POINT = attrgetter("x", "y", "z")
 _MARKS = {
     "road_line": ("polyline", MarkType.ROAD_LINE),
@@ -61,40 +56,36 @@ class WomdReader(Reader):
 
     def _read(self, path: Path) -> Iterator[Item]:
         for index, payload in enumerate(read_records(path)):
-            if isinstance(payload, DataError):
-                yield payload
-            else:
-                yield self._convert(payload, path, f"record {index}")
+            yield (
+                payload if isinstance(payload, DataError) else self._convert(payload, path, f"record {index}")
+            )
 
     def _convert(self, payload: bytes, path: Path, record: str) -> Item:
         name = None
         try:
             scenario = pb.Scenario.FromString(payload)
             name = _name(scenario)
-            # Absurd numbers may overflow on the way: the result is not finite, which validation reports.
-            with np.errstate(over="ignore", invalid="ignore"):
-                return scenario_to_segment(scenario, file=path.name)
+            return scenario_to_segment(scenario, file=path.name)
         except (DecodeError, UnicodeDecodeError) as error:
             return DataError(f"not a Scenario message: {error}", file=path, segment=name, field=record)
         except DataError as error:
             field = f"{record}, {error.field}" if error.field else record
             return DataError(error.message, file=path, segment=name, field=field)
         except Exception as error:  # the other records of the file are still to be read
-            return unexpected(error, file=path, segment=name)
+            return base.unexpected(error, file=path, segment=name)
 
 
 def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
-    """Convert one decoded record; the result is not validated yet. A :class:`DataError` names the format's field."""
+    """Convert one decoded record, not validated yet; a :class:`DataError` names the format's field."""
     name = _name(scenario)
     times = np.array(scenario.timestamps_seconds, np.float64)
     steps = len(times)
-    if steps < 2 or not np.isfinite(times).all():
-        raise DataError(f"{steps} steps, needs at least 2 finite ones", field="timestamps_seconds")
-    dt = time_step(times, "timestamps_seconds")
+    fine = steps >= 2 and np.isfinite(times).all()
+    refuse(not fine, f"{steps} steps, needs at least 2 finite ones", "timestamps_seconds")
+    dt = base.time_step(times, "timestamps_seconds")
     states, kept, renumber = _tracks(scenario, steps)
     ego = _index(scenario.sdc_track_index, renumber, "sdc_track_index")
-    if ego < 0:
-        raise DataError("the recording vehicle is valid at no step", field="sdc_track_index")
+    refuse(ego < 0, "the recording vehicle is valid at no step", "sdc_track_index")
     valid = states[..., 9] != 0
     origin = np.round(states[ego, np.argmax(valid[ego]), :3])
     lanes, boundary, marks = _features(scenario.map_features)
@@ -102,26 +93,21 @@ def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
         _check_count(len(getattr(scenario, field)), MAX_AGENTS, field)
     tracks = [scenario.tracks[i] for i in kept]
     ids = np.array([track.id for track in tracks], np.int64)
-    types = np.array([track.object_type for track in tracks], np.int64)
     predict = [_index(p.track_index, renumber, "tracks_to_predict") for p in scenario.tracks_to_predict]
     where = {track: i for i, track in enumerate(ids.tolist())}
     interest = [where[track] for track in scenario.objects_of_interest if track in where]
-    masked = np.where(valid[..., None], states, 0.0)
     segment = RunSegment(
         segment_id=name,
         source=WomdReader.name,
         dt=dt,
         ego=ego,
         agent_id=ids,
-        agent_type=codes(types, len(AgentType), "tracks.object_type"),
-        size=to_float32(_sizes(states[..., 3:6], valid, scenario.current_time_index)),
-        position=to_float32(np.where(valid[..., None], masked[..., :3] - origin, 0.0)),
-        heading=to_float32(masked[..., 6]),
-        velocity=to_float32(masked[..., 7:9]),
-        valid=valid,
-        road=road_map(lanes, origin, boundary, marks),
-        **lights(_signals(scenario, steps, lanes), steps, origin),
+        agent_type=_codes([track.object_type for track in tracks], len(AgentType), "tracks.object_type"),
+        size=base.to_float32(_sizes(states[..., 3:6], valid, scenario.current_time_index)),
+        **motion(states[..., :3] - origin, states[..., 6], states[..., 7:9], valid),
         origin=origin,
+        road=lines.road_map(lanes, origin, boundary, marks),
+        **lines.lights(_signals(scenario, steps, lanes), steps, origin),
         current_step=scenario.current_time_index,
         interest=np.array(interest, np.int32),
         predict=np.array([p for p in predict if p >= 0], np.int32),
@@ -131,49 +117,49 @@ def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
 
 
 def _check_count(count: int, most: int, field: str) -> None:
-    if count > most:
-        raise DataError(f"{count} entries, at most {most} are read", field=field)
+    refuse(count > most, f"{count} entries, at most {most} are read", field)
+
+
+def _codes(numbers: Sequence[int], count: int, field: str) -> NDArray[np.uint8]:
+    """Return enumeration values as uint8; a :class:`DataError` where one is outside 0 … count - 1."""
+    values = np.array(numbers, np.int64)
+    bad = values[(values < 0) | (values >= count)]
+    refuse(len(bad), f"unknown value {bad[:1]}, expected 0 … {count - 1}", field)
+    return values.astype(np.uint8)
 
 
 def _name(scenario: pb.Scenario) -> str:
     name: str | bytes = scenario.scenario_id
-    if not name:
-        raise DataError("missing; is this a WOMD Scenario record?", field="scenario_id")
+    refuse(not name, "missing; is this a WOMD Scenario record?", "scenario_id")
     # Where a string is not UTF-8, protobuf's runtimes either refuse the record or hand over its bytes.
-    if isinstance(name, bytes):
-        raise DataError(f"{name!r} is not UTF-8", field="scenario_id")
-    return name
+    refuse(isinstance(name, bytes), f"{name!r} is not UTF-8", "scenario_id")
+    return str(name)
 
 
 def _tracks(scenario: pb.Scenario, steps: int) -> tuple[Doubles, list[int], dict[int, int]]:
-    """(states [A, T, 10], the tracks they are, track index in the record -> row or -1 where left out)."""
+    """Return states [A, T, 10], the tracks they are, and track index in the record -> row, -1 where left out."""
     tracks = scenario.tracks
-    if not tracks:
-        raise DataError("has no agents", field="tracks")
+    refuse(not tracks, "has no agents", "tracks")
     check_counts(len(tracks), steps, "tracks")
     for track in tracks:
-        if len(track.states) != steps:
-            raise DataError(
-                f"track {track.id} has {len(track.states)} states for {steps} steps", field="tracks.states"
-            )
+        count = len(track.states)
+        refuse(count != steps, f"track {track.id} has {count} states for {steps} steps", "tracks.states")
     numbers = chain.from_iterable(map(_STATE, chain.from_iterable(track.states for track in tracks)))
     states = np.fromiter(numbers, np.float64, len(tracks) * steps * 10).reshape(len(tracks), steps, 10)
     seen = (states[..., 9] != 0).any(axis=1)
-    kept = np.flatnonzero(seen).tolist()
     rows = np.where(seen, np.cumsum(seen) - 1, -1)
-    return states[seen], kept, dict(enumerate(rows.tolist()))
+    return states[seen], np.flatnonzero(seen).tolist(), dict(enumerate(rows.tolist()))
 
 
 def _index(track: int, renumber: dict[int, int], field: str) -> int:
-    if track not in renumber:
-        raise DataError(f"track index {track} outside the {len(renumber)} tracks", field=field)
+    refuse(track not in renumber, f"track index {track} outside the {len(renumber)} tracks", field)
     return renumber[track]
 
 
-def _sizes(sizes: Doubles, valid: NDArray[np.bool_], current: int) -> Doubles:
-    """[A, 3] from [A, T, 3]."""
-    if not 0 <= current < valid.shape[1]:
-        raise DataError(f"{current} outside the {valid.shape[1]} steps", field="current_time_index")
+def _sizes(sizes: Doubles, valid: Bools, current: int) -> Doubles:
+    """Return [A, 3] from [A, T, 3]."""
+    steps = valid.shape[1]
+    refuse(not 0 <= current < steps, f"{current} outside the {steps} steps", "current_time_index")
     result = sizes[:, current].copy()
     for agent in np.flatnonzero(~valid[:, current]):
         result[agent] = np.median(sizes[agent, valid[agent]], axis=0)
@@ -187,7 +173,7 @@ def _points(points: Iterable[pb.MapPoint]) -> Doubles:
 def _features(
     features: Sequence[pb.MapFeature],
 ) -> tuple[list[Lane], list[Doubles], list[tuple[Doubles, MarkType]]]:
-    """Lanes, road edges, and marks with their types."""
+    """Return lanes, road edges, and marks with their types."""
     _check_count(len(features), MAX_FEATURES, "map_features")
     found: list[tuple[int, Any]] = []
     edges: list[Doubles] = []
@@ -208,9 +194,7 @@ def _features(
                 marks.append((ring if attribute == "polygon" else points, mark))
     for name in ("exit_lanes", "left_neighbors", "right_neighbors"):
         _check_count(sum(len(getattr(lane, name)) for _, lane in found), MAX_LINKS, "map_features.lane")
-    types = codes(
-        np.array([lane.type for _, lane in found], np.int64), len(LaneType), "map_features.lane.type"
-    )
+    types = _codes([lane.type for _, lane in found], len(LaneType), "map_features.lane.type")
     lanes = [
         Lane(
             name=lane_id,
@@ -229,10 +213,9 @@ def _features(
 def _signals(
     scenario: pb.Scenario, steps: int, lanes: Sequence[Lane]
 ) -> dict[int, tuple[Doubles, NDArray[np.uint8]]]:
-    """Lane -> (stop point [3], state [T])."""
+    """Return lane -> (stop point [3], state [T])."""
     logged = scenario.dynamic_map_states
-    if logged and len(logged) != steps:
-        raise DataError(f"{len(logged)} entries for {steps} steps", field="dynamic_map_states")
+    refuse(logged and len(logged) != steps, f"{len(logged)} entries for {steps} steps", "dynamic_map_states")
     _check_count(sum(len(now.lane_states) for now in logged), MAX_LINKS, "dynamic_map_states")
     index = {lane.name: k for k, lane in enumerate(lanes)}
     stops: dict[int, Doubles] = {}
@@ -246,8 +229,7 @@ def _signals(
                     stops[lane] = _points([light.stop_point])[0] if given else lanes[lane].line[0]
                 entries.append((lane, step, light.state))
     check_signals(len(stops), steps, "dynamic_map_states")
-    table = np.array(entries, np.int64).reshape(-1, 3)
-    states = codes(table[:, 2], len(SignalState), "dynamic_map_states.state")
+    states = _codes([state for *_, state in entries], len(SignalState), "dynamic_map_states.state")
     found = {lane: np.full(steps, SignalState.UNKNOWN, np.uint8) for lane in stops}
     for (lane, step, _), state in zip(entries, states.tolist(), strict=True):
         found[lane][step] = state

@@ -1,4 +1,4 @@
-"""Safe XML loading, and the numbers and points in such files."""
+"""Safe loading of XML, and the numbers in it."""
 
 from __future__ import annotations
 
@@ -7,18 +7,10 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-import numpy as np
-from numpy.typing import NDArray
-
 from symphony.data.sources.base import read_whole
 from symphony.errors import DataError
 
-Doubles = NDArray[np.float64]
-
-MAX_REFERENCES = 200
-"""References of one kind in a lanelet; junctions have a handful."""
-MAX_NUMBER = 1e8
-"""Larger magnitudes are no metres, seconds or radians of a road."""
+MAX_NUMBER = 1e8  # larger magnitudes are no metres, seconds or radians of a road
 
 
 def load_xml(path: Path, what: str = "CommonRoad") -> ET.Element:
@@ -42,7 +34,7 @@ def load_xml(path: Path, what: str = "CommonRoad") -> ET.Element:
 
 
 def number(text: str | None, field: str) -> float:
-    """A finite number of at most :data:`MAX_NUMBER`."""
+    """Return a finite number of at most :data:`MAX_NUMBER`."""
     try:
         value = float(text or "")
     except ValueError:
@@ -53,7 +45,7 @@ def number(text: str | None, field: str) -> float:
 
 
 def integer(text: str | None, field: str) -> int:
-    """An id or a count."""
+    """Return an id or a count of 64 bits."""
     try:
         value = int(text or "")
     except ValueError:
@@ -61,22 +53,3 @@ def integer(text: str | None, field: str) -> int:
     if not -(2**63) <= value < 2**63:
         raise DataError("the integer exceeds 64 bits", field=field)
     return value
-
-
-def point(node: ET.Element, field: str) -> tuple[float, float]:
-    """The x and y children of an element."""
-    return number(node.findtext("x"), field), number(node.findtext("y"), field)
-
-
-def points(node: ET.Element | None, field: str) -> Doubles:
-    """[P, 2] the ``point`` children of an element, none if it is missing."""
-    children = [] if node is None else node.findall("point")
-    return np.array([point(child, field) for child in children], np.float64).reshape(-1, 2)
-
-
-def references(node: ET.Element, tag: str, field: str) -> tuple[int, ...]:
-    """The ``ref`` attributes of all children of that tag, at most :data:`MAX_REFERENCES`."""
-    children = node.findall(tag)
-    if len(children) > MAX_REFERENCES:
-        raise DataError(f"{len(children)} references, at most {MAX_REFERENCES}", field=f"{field}: {tag}")
-    return tuple(integer(child.get("ref"), f"{field}: {tag}") for child in children)

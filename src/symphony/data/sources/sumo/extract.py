@@ -7,21 +7,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from symphony.data.overlaps import box_depth
-from symphony.data.segment import AgentType, Bools, RunSegment, validate
+from symphony.data.segment import AgentType, Bools, Floats, RunSegment, validate
 from symphony.data.selection import MOVING
+from symphony.data.sources.base import Doubles, motion
 from symphony.data.sources.sumo.roads import Crop, Network, crop_network
-from symphony.data.sources.sumo.simulate import STEP, Traffic
-
-Doubles = NDArray[np.float64]
+from symphony.data.sources.sumo.traffic import STEP, Traffic
 
 DT = 0.2
-STATES = 51
-"""Steps of a segment unless told otherwise: 10 s, that is 50 decisions after the first state."""
 EVERY = round(DT / STEP)
-
 MAX_OVERLAP = 0.05
 MAX_ACCELERATION = 7.5
 MAX_YAW_RATE = 1.6
@@ -53,31 +48,20 @@ class CropRule:
     partner_distance: float = 40.0
     focuses: int = 6
     per_focus: int = 12
-    steps: int = STATES
+    steps: int = 51
     interactive: int = 2
     turn_interest: float = 1.2
 
 
-RULES = {
-    "town": CropRule(),
-    "grid": CropRule(),
-    "ramp": CropRule(radius=190, ego_radius=165, agent_radius=180, focuses=4),
-}
-"""Defaults per kind of network: freeways need longer maps for the same ten seconds."""
-_GROWTH = {"ramp": 13.5}
-"""Metres per second beyond the tenth by which all radii grow; elsewhere :data:`_TOWN_GROWTH`."""
-_TOWN_GROWTH = 4.5
-
-
 def crop_rule(kind: str, seconds: float = 10.0, interactive: int = 2) -> CropRule:
-    """The kind's rule for segments of so many seconds.
+    """Return the kind's rule for segments of so many seconds.
 
-    Longer segments get larger maps, so that a vehicle which drives on has road ahead of it to the end, and from
-    fewer points of the network, as those maps overlap more.
+    Longer segments get larger maps, so that a vehicle which drives on has road ahead of it to the end; freeways need
+    longer maps for the same ten seconds, and from fewer points of the network, as those maps overlap more.
     """
-    rule = RULES.get(kind, CropRule())
-    more = max(0.0, seconds - 10.0)
-    grown = more * _GROWTH.get(kind, _TOWN_GROWTH)
+    ramp = kind == "ramp"
+    rule = CropRule(radius=190, ego_radius=165, agent_radius=180, focuses=4) if ramp else CropRule()
+    grown = max(0.0, seconds - 10.0) * (13.5 if ramp else 4.5)
     radii = {name: getattr(rule, name) + grown for name in ("radius", "ego_radius", "agent_radius")}
     return replace(rule, **radii, steps=round(seconds / DT) + 1, interactive=interactive)
 
@@ -85,7 +69,7 @@ def crop_rule(kind: str, seconds: float = 10.0, interactive: int = 2) -> CropRul
 def cut_segments(
     name: str, network: Network, traffic: Traffic, rng: np.random.Generator, rule: CropRule
 ) -> tuple[list[RunSegment], Counter[str]]:
-    """Cut segments, one ego each, from windows that do not overlap at each focus; also says why windows gave none.
+    """Cut segments, one ego each, from windows that do not overlap at each focus; also say why windows gave none.
 
     Segments of one focus share one :class:`RoadMap` object and one origin.
     """
@@ -111,7 +95,7 @@ def cut_segments(
 
 
 def _focuses(network: Network, rng: np.random.Generator, rule: CropRule) -> list[Doubles]:
-    """Junctions, rounded to metres, at least half a radius apart."""
+    """Return junctions, rounded to metres, at least half a radius apart."""
     chosen: list[Doubles] = []
     for center in np.round(rng.permutation(network.centers)):
         near = [float(np.linalg.norm(center - other)) < rule.radius / 2 for other in chosen]
@@ -121,7 +105,7 @@ def _focuses(network: Network, rng: np.random.Generator, rule: CropRule) -> list
 
 
 def _at_steps(traffic: Traffic) -> tuple[Traffic, Bools]:
-    """Traffic at the steps of segments, and which of these states [V, N] are not physical."""
+    """Return traffic at the steps of segments, and which of these states [V, N] are not physical."""
     velocity, heading = traffic.velocity, traffic.heading
     with np.errstate(invalid="ignore"):
         # Over 0.2 s, as the limits were measured.
@@ -134,7 +118,7 @@ def _at_steps(traffic: Traffic) -> tuple[Traffic, Bools]:
     names = ("position", "heading", "velocity", "present")
     picked = {name: getattr(traffic, name)[:, ::EVERY] for name in names}
     lights = {light: states[:, ::EVERY] for light, states in traffic.lights.items()}
-    return replace(traffic, time=traffic.time[::EVERY], lights=lights, **picked), wild[:, ::EVERY]
+    return replace(traffic, lights=lights, **picked), wild[:, ::EVERY]
 
 
 def _cut(
@@ -146,7 +130,7 @@ def _cut(
     rng: np.random.Generator,
     rule: CropRule,
 ) -> RunSegment | str:
-    """One segment, or why there is none."""
+    """Return one segment, or why there is none."""
     window = slice(start, start + rule.steps)
     position = tracks.position[:, window] - crop.center
     away = np.linalg.norm(position, axis=-1)
@@ -156,10 +140,11 @@ def _cut(
     agents = np.flatnonzero(valid.sum(1) >= _MIN_STEPS)
     if not stays[agents].any():
         return "no vehicle stays near the focus"
-    position, valid, stays = position[agents], valid[agents], stays[agents]
+    position, valid, stays, size = position[agents], valid[agents], stays[agents], tracks.size[agents]
     heading, velocity = tracks.heading[agents, window], tracks.velocity[agents, window]
-    size = tracks.size[agents]
-    travel = _travel(position, valid)
+    rows, seen = np.arange(len(agents)), valid.argmax(1)
+    # The farthest each vehicle gets from where it is first seen.
+    travel = np.where(valid, np.linalg.norm(position - position[rows, seen, None], axis=-1), 0).max(1)
     weight = _interest(position, heading, velocity, valid, travel, rule) * (stays & (travel > _EGO_TRAVEL))
     if weight.sum() == 0:
         return "no moving ego with a moving partner"
@@ -172,10 +157,8 @@ def _cut(
         return "off the road"
     ego = int(rng.choice(len(agents), p=weight / weight.sum()))
     lights = [tracks.lights[light][link, window] for light, link in crop.signals]
-    mask = valid[..., None]
     # Unwrapped since the vehicle appeared; whole turns before the window mean nothing here.
-    turns = np.round(np.nan_to_num(heading[np.arange(len(agents)), valid.argmax(1)]) / (2 * np.pi))
-    heading = heading - 2 * np.pi * turns[:, None]
+    turns = np.round(np.nan_to_num(heading[rows, seen]) / (2 * np.pi))
     return validate(
         RunSegment(
             segment_id=f"{name}-v{agents[ego]}",
@@ -185,10 +168,7 @@ def _cut(
             agent_id=agents.astype(np.int64),
             agent_type=np.full(len(agents), AgentType.VEHICLE, np.uint8),
             size=size,
-            position=np.where(mask, np.pad(position, ((0, 0), (0, 0), (0, 1))), 0).astype(np.float32),
-            heading=np.where(valid, heading, 0).astype(np.float32),
-            velocity=np.where(mask, velocity, 0).astype(np.float32),
-            valid=valid,
+            **motion(position, heading - 2 * np.pi * turns[:, None], velocity, valid),
             road=crop.road,
             signal_lane=crop.signal_lane,
             signal_point=crop.signal_point,
@@ -198,17 +178,10 @@ def _cut(
     )
 
 
-def _travel(position: Doubles, valid: Bools) -> Doubles:
-    """[A] the farthest each vehicle gets from where it is first seen."""
-    first = position[np.arange(len(position)), valid.argmax(1)]
-    away = np.linalg.norm(position - first[:, None], axis=-1)
-    return np.where(valid, away, 0).max(1)
-
-
 def _interest(
     position: Doubles, heading: Doubles, velocity: Doubles, valid: Bools, travel: Doubles, rule: CropRule
 ) -> Doubles:
-    """[A] chance of being the ego: turning, closeness to others and changes of speed count; 0 without partner."""
+    """Return [A] chance of being the ego, 0 without partner: turning, closeness and changes of speed count."""
     distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
     distance = np.where(valid[:, None] & valid[None], distance, np.inf)
     distance[np.arange(len(position)), np.arange(len(position))] = np.inf
@@ -222,8 +195,8 @@ def _interest(
     return has_partner * (0.3 + rule.turn_interest * turns + 0.5 * near + 0.5 * changes)
 
 
-def _overlap(position: Doubles, heading: Doubles, size: NDArray[np.float32], valid: Bools) -> bool:
-    """Whether the boxes of two vehicles ever share more than :data:`MAX_OVERLAP` metres."""
+def _overlap(position: Doubles, heading: Doubles, size: Floats, valid: Bools) -> bool:
+    """Return whether the boxes of two vehicles ever share more than :data:`MAX_OVERLAP` metres."""
     first, second = np.triu_indices(len(position), 1)
     sides = size[:, :2].astype(np.float64)
     reach = np.linalg.norm(sides / 2, axis=-1)
@@ -232,5 +205,4 @@ def _overlap(position: Doubles, heading: Doubles, size: NDArray[np.float32], val
     pair, step = np.nonzero(valid[first] & valid[second] & close)
     a, b = first[pair], second[pair]
     way = position[b, step] - position[a, step]
-    depth = box_depth(way, heading[a, step], sides[a], heading[b, step], sides[b])
-    return bool((depth > MAX_OVERLAP).any())
+    return bool((box_depth(way, heading[a, step], sides[a], heading[b, step], sides[b]) > MAX_OVERLAP).any())

@@ -7,80 +7,67 @@ from __future__ import annotations
 
 import re
 import shutil
-import xml.etree.ElementTree as ET  # files are our own
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from symphony.data.sources.base import Doubles, located
 from symphony.data.sources.sumo.process import run_program
 from symphony.errors import DataError
 
-Point = NDArray[np.float64]
-"""Points [..., 2] in metres."""
 COMMON = (
     "--no-turnarounds true --junctions.corner-detail 8 --junctions.internal-link-detail 20 "
     "--junctions.limit-turn-speed 3.5 --default.connection.cont-pos 0 --tls.yellow.time 3 --tls.allred.time 2 "
     "--no-warnings true"
 )
 """Options of every network."""
-_THROUGH = 0.75
-"""Cosine of the sharpest bend of an arterial at a junction."""
-_FEWEST_STREETS = 8
-SHARPEST_ANGLE = 1.05
-"""Radians between two streets at a junction, at least where one of them is bent."""
+SHARPEST_ANGLE = 1.05  # radians between two streets at a junction, at least where one of them is bent
 LATERAL_ACCELERATION = 3.0
 """m/s² that the speed limits of curved streets allow for; drivers exceed limits by up to 30 %."""
 RAMP_RADIUS = 190.0
 """Radius in metres of the largest map that fits between the ends of a freeway and of its ramps."""
+OWN_ROADS = {".xodr": "--opendrive-files", ".osm": "--osm-files", ".net.xml": "--sumo-net-file"}
+"""Endings of road networks of one's own (OpenDRIVE, OpenStreetMap, SUMO), and how ``netconvert`` is told of them."""
+
+Pairs = list[tuple[int, int]]
+Road = tuple[int, float, float]  # lanes, speed limit, width of a lane
 
 
 @dataclass
 class PlainNetwork:
-    """Nodes, edges and explicit connections, as lines of SUMO's plain XML."""
+    """Nodes, edges and explicit connections, as lines of SUMO's plain XML; points are [2] metres."""
 
     nodes: list[str] = field(default_factory=list)
     edges: list[str] = field(default_factory=list)
     connections: list[str] = field(default_factory=list)
 
-    def node(self, name: str, point: Point, control: str, radius: float | None = None) -> None:
+    def node(self, name: str, point: Doubles, control: str, radius: float | None = None) -> None:
         """Add a junction."""
         size = "" if radius is None else f' radius="{radius:.2f}"'
         self.nodes.append(f'<node id="{name}" x="{point[0]:.2f}" y="{point[1]:.2f}" type="{control}"{size}/>')
 
     def edge(
-        self,
-        start: str,
-        end: str,
-        *,
-        lanes: int,
-        speed: float,
-        width: float,
-        priority: int,
-        shape: Point,
-        spread: str = "right",
+        self, ends: tuple[str, str], shape: Doubles, road: Road, priority: int, spread: str = "right"
     ) -> str:
         """Add a one-way edge and return its id."""
-        name = f"{start}_{end}"
+        name = "_".join(ends)
         points = " ".join(f"{x:.2f},{y:.2f}" for x, y in shape)
+        lanes, speed, width = road
         self.edges.append(
-            f'<edge id="{name}" from="{start}" to="{end}" numLanes="{lanes}" speed="{speed:.2f}" '
+            f'<edge id="{name}" from="{ends[0]}" to="{ends[1]}" numLanes="{lanes}" speed="{speed:.2f}" '
             f'width="{width:.2f}" priority="{priority}" spreadType="{spread}" shape="{points}"/>'
         )
         return name
 
-    def connect(self, start: str, end: str, pairs: list[tuple[int, int]]) -> None:
+    def connect(self, start: str, end: str, pairs: Pairs) -> None:
         """Allow exactly these lane-to-lane connections between two edges."""
-        self.connections += [
-            f'<connection from="{start}" to="{end}" fromLane="{i}" toLane="{j}"/>' for i, j in pairs
-        ]
+        both = f'<connection from="{start}" to="{end}"'
+        self.connections += [f'{both} fromLane="{i}" toLane="{j}"/>' for i, j in pairs]
 
     def compile(self, folder: Path, options: str) -> Path:
-        """Write the XML and run ``netconvert``; returns the network file."""
+        """Write the XML, run ``netconvert`` and return the network file."""
         arguments = f"--output-file net.net.xml {COMMON} {options}"
         for kind, lines in (("node", self.nodes), ("edge", self.edges), ("connection", self.connections)):
             if lines:
@@ -102,14 +89,14 @@ class _Link:
 
     a: int
     b: int
-    line: Point
+    line: Doubles
     arterial: bool
     lanes: int
     speed: float
 
 
-def _town_links(rng: np.random.Generator, columns: int, rows: int) -> list[tuple[int, int]]:
-    """Neighbouring nodes of the grid, some pairs dropped while every node keeps two streets and all connect."""
+def _town_links(rng: np.random.Generator, columns: int, rows: int) -> Pairs:
+    """Return neighbours in the grid, some pairs dropped while every node keeps two streets and all connect."""
     index = np.arange(columns * rows).reshape(rows, columns)
     across = zip(index[:, :-1].ravel(), index[:, 1:].ravel(), strict=True)
     down = zip(index[:-1].ravel(), index[1:].ravel(), strict=True)
@@ -123,19 +110,16 @@ def _town_links(rng: np.random.Generator, columns: int, rows: int) -> list[tuple
     return pairs
 
 
-def _connected(pairs: list[tuple[int, int]], count: int) -> bool:
-    label = np.arange(count)
+def _connected(pairs: Pairs, count: int) -> bool:
+    label = list(range(count))
     for _ in range(count):
-        before = label.copy()
         for a, b in pairs:
             label[a] = label[b] = min(label[a], label[b])
-        if (label == before).all():
-            break
-    return bool((label == 0).all())
+    return not any(label)
 
 
-def _bezier(start: Point, end: Point, bend: Point, count: int = 12) -> Point:
-    """Cubic curve [count, 2] from start to end whose two control points are moved sideways by ``bend``."""
+def _bezier(start: Doubles, end: Doubles, bend: Doubles, count: int = 12) -> Doubles:
+    """Return a cubic curve [count, 2] whose two control points are moved sideways by ``bend``."""
     along = end - start
     normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
     first, second = start + along / 3 + normal * bend[0], start + 2 * along / 3 + normal * bend[1]
@@ -143,36 +127,40 @@ def _bezier(start: Point, end: Point, bend: Point, count: int = 12) -> Point:
     return (1 - t) ** 3 * start + 3 * t * (1 - t) ** 2 * first + 3 * t**2 * (1 - t) * second + t**3 * end
 
 
-def _street(rng: np.random.Generator, nodes: Point, links: list[_Link], a: int, b: int) -> Point:
-    """Centre line from node a to b: bent, unless it would meet a street there is at a sharp angle."""
+def _street(rng: np.random.Generator, nodes: Doubles, links: list[_Link], a: int, b: int) -> Doubles:
+    """Return a centre line from node a to b: bent, unless it would meet a street there is at a sharp angle."""
     straight = _bezier(nodes[a], nodes[b], np.zeros(2))
     if rng.random() > 0.7:
         return straight
     for _ in range(4):
         line = _bezier(nodes[a], nodes[b], rng.normal(0, 9, 2).clip(-16, 16))
         angles = [
-            abs(np.angle(np.exp(1j * (_departure(line if end == a else line[::-1]) - _departure(other)))))
+            abs(np.angle(np.exp(1j * (_departure(line if end == a else line[::-1]) - other))))
             for end in (a, b)
-            for other in _leaving(links, end)
+            for other in _departures(links, end)
         ]
         if min(angles, default=np.pi) > SHARPEST_ANGLE:
             return line
     return straight
 
 
-def _leaving(links: list[_Link], node: int) -> list[Point]:
-    """Centre lines of the streets at a node, from it outwards."""
-    return [link.line if link.a == node else link.line[::-1] for link in links if node in (link.a, link.b)]
+def _departures(links: list[_Link], node: int) -> list[float]:
+    """Return the directions in which the streets at a node leave it."""
+    return [
+        _departure(link.line if link.a == node else link.line[::-1])
+        for link in links
+        if node in (link.a, link.b)
+    ]
 
 
-def _departure(line: Point) -> float:
-    """Direction of a line over its first third."""
+def _departure(line: Doubles) -> float:
+    """Return the direction of a line over its first third."""
     towards = line[len(line) // 3] - line[0]
     return float(np.arctan2(towards[1], towards[0]))
 
 
-def _comfortable_speed(line: Point) -> float:
-    """Speed at which the tightest bend of a street asks for :data:`LATERAL_ACCELERATION`."""
+def _comfortable_speed(line: Doubles) -> float:
+    """Return the speed at which the tightest bend of a street asks for :data:`LATERAL_ACCELERATION`."""
     along = np.diff(line, axis=0)
     turn = np.diff(np.unwrap(np.arctan2(along[:, 1], along[:, 0])))
     step = np.linalg.norm(along, axis=-1)
@@ -180,16 +168,18 @@ def _comfortable_speed(line: Point) -> float:
     return float(np.sqrt(LATERAL_ACCELERATION / max(curvature.max(), 1e-3)))
 
 
+def _rotation(angle: float) -> Doubles:
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
 def town(rng: np.random.Generator, folder: Path) -> Path:
-    """A jittered and rotated grid of curved streets with T-junctions, mixed control and roundabouts."""
+    """Make a jittered and rotated grid of curved streets with T-junctions, mixed control and roundabouts."""
     columns, rows = int(rng.integers(3, 6)), int(rng.integers(3, 5))
     step = rng.uniform(75, 115, 2)
     gx, gy = np.meshgrid(np.arange(columns), np.arange(rows))
     flat = np.stack([gx.ravel() * step[0], gy.ravel() * step[1]], -1)
     flat += rng.normal(0, 9, flat.shape).clip(-18, 18)
-    turn = rng.uniform(0, 2 * np.pi)
-    spin = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    nodes = flat @ spin.T
+    nodes = flat @ _rotation(rng.uniform(0, 2 * np.pi)).T
     main_rows = set(rng.choice(rows, 1 + (rows > 3), replace=False).tolist())
     main_columns = set(rng.choice(columns, 1, replace=False).tolist())
 
@@ -206,11 +196,6 @@ def town(rng: np.random.Generator, folder: Path) -> Path:
         main = is_main(a, b)
         lanes, speed = arterial if main else collector
         links.append(_Link(a, b, line, main, lanes, min(speed, _comfortable_speed(line))))
-    return _build(rng, folder, nodes, links, width)
-
-
-def _build(rng: np.random.Generator, folder: Path, nodes: Point, links: list[_Link], width: float) -> Path:
-    """The network of some two-way streets, with lights, roundabouts and other junctions at its nodes."""
     net = PlainNetwork()
     rings = _add_nodes(net, rng, nodes, links)
     for link in links:
@@ -220,9 +205,8 @@ def _build(rng: np.random.Generator, folder: Path, nodes: Point, links: list[_Li
         if link.b in rings:
             end, line = rings[link.b].enter(end, line[::-1])
             line = line[::-1]
-        priority = 5 if link.arterial else 3
         for ends, shape in (((start, end), line), ((end, start), line[::-1])):
-            net.edge(*ends, lanes=link.lanes, speed=link.speed, width=width, priority=priority, shape=shape)
+            net.edge(ends, shape, (link.lanes, link.speed, width), 5 if link.arterial else 3)
     for ring in rings.values():
         ring.write(net, width + 0.8)
     layout = _signal_layout(rng)
@@ -233,21 +217,20 @@ def _build(rng: np.random.Generator, folder: Path, nodes: Point, links: list[_Li
 class _Ring:
     """A roundabout around a point; streets are cut where they meet it."""
 
-    center: Point
+    center: Doubles
     radius: float
     arms: list[tuple[float, str]] = field(default_factory=list)
 
-    def enter(self, name: str, line: Point) -> tuple[str, Point]:
-        """Cut a line that starts at the centre where it leaves the ring; returns the ring's node and the rest."""
+    def enter(self, name: str, line: Doubles) -> tuple[str, Doubles]:
+        """Cut a line that starts at the centre where it leaves the ring; return the ring's node and the rest."""
         outside = np.linalg.norm(line - self.center, axis=-1) > self.radius + 6
         rest = line[int(np.argmax(outside)) :]
         towards = rest[0] - self.center
         angle = float(np.arctan2(towards[1], towards[0]))
-        arm = f"{name}r{len(self.arms)}"
-        self.arms.append((angle, arm))
-        return arm, np.concatenate([[self._at(angle)], rest])
+        self.arms.append((angle, f"{name}r{len(self.arms)}"))
+        return self.arms[-1][1], np.concatenate([[self._at(angle)], rest])
 
-    def _at(self, angle: float | NDArray[np.float64]) -> Point:
+    def _at(self, angle: float | Doubles) -> Doubles:
         return self.center + self.radius * np.stack([np.cos(angle), np.sin(angle)], -1)
 
     def write(self, net: PlainNetwork, width: float) -> None:
@@ -258,34 +241,30 @@ class _Ring:
             net.node(node, self._at(angle), "priority", radius=6.0)
             sweep = (following - angle) % (2 * np.pi)
             arc = self._at(angle + np.linspace(0, sweep, max(4, int(sweep * 8))))
-            names.append(
-                net.edge(node, end, lanes=1, speed=7.5, width=width, priority=9, shape=arc, spread="center")
-            )
+            names.append(net.edge((node, end), arc, (1, 7.5, width), 9, spread="center"))
         nodes = " ".join(node for _, node in arms)
         net.edges.append(f'<roundabout nodes="{nodes}" edges="{" ".join(names)}"/>')
 
 
 def _add_nodes(
-    net: PlainNetwork, rng: np.random.Generator, nodes: Point, links: list[_Link]
+    net: PlainNetwork, rng: np.random.Generator, nodes: Doubles, links: list[_Link]
 ) -> dict[int, _Ring]:
-    """Add a junction per node, except where a roundabout takes its place; returns the roundabouts."""
+    """Add a junction per node, except where a roundabout takes its place; return the roundabouts."""
     rings: dict[int, _Ring] = {}
     wanted = int(rng.integers(0, 4))
     for k in rng.permutation(len(nodes)):
         meeting = [link for link in links if k in (link.a, link.b)]
-        big = [link.arterial for link in meeting]
-        angles = np.sort([_departure(line) for line in _leaving(links, int(k))])
+        big = sum(link.arterial for link in meeting)
+        angles = np.sort(_departures(links, int(k)))
         gaps = np.diff([*angles, angles[0] + 2 * np.pi])
         # Wide streets close together would pave over the island.
         roomy = gaps.min() > 1.2 and max(link.lanes for link in meeting) <= 2
         if len(rings) < wanted and len(meeting) >= 3 and roomy:
             rings[int(k)] = _Ring(nodes[k], float(rng.uniform(15, 21)))
             continue
-        if len(meeting) == 2:
-            control = "priority"
-        elif sum(big) >= 3:
-            control = "traffic_light"
-        elif any(big):
+        if len(meeting) == 2 or big >= 3:
+            control = "priority" if len(meeting) == 2 else "traffic_light"
+        elif big:
             control = str(rng.choice(["traffic_light", "priority", "priority_stop"], p=[0.7, 0.2, 0.1]))
         else:
             minor = ["priority", "allway_stop", "right_before_left", "traffic_light"]
@@ -295,27 +274,27 @@ def _add_nodes(
 
 
 def grid(rng: np.random.Generator, folder: Path) -> Path:
-    """A perturbed rectangular grid with left-turn pockets; one kind of control for all junctions."""
+    """Make a perturbed rectangular grid with left-turn pockets; one kind of control for all junctions."""
     controls = ["traffic_light", "priority", "allway_stop", "right_before_left"]
     control = str(rng.choice(controls, p=[0.4, 0.2, 0.2, 0.2]))
     length, spread = rng.uniform(100, 140), rng.uniform(4, 12)
     x, y = rng.integers(3, 5), rng.integers(3, 5)
-    arguments = f"--grid --grid.x-number {x} --grid.y-number {y} --grid.x-length {length:.2f}"
-    arguments += f" --grid.y-length {length * rng.uniform(0.85, 1.2):.2f}"
-    arguments += f" --turn-lanes 1 --turn-lanes.length {rng.uniform(30, 45):.1f}"
-    arguments += f" --perturb-x norm(0,{spread:.2f}) --perturb-y norm(0,{spread:.2f})"
-    arguments += f" --default-junction-type {control} --default.lanenumber {rng.integers(1, 3)}"
-    arguments += (
-        f" --default.lanewidth {rng.uniform(3.2, 3.7):.2f} --default.speed {rng.choice([11.18, 13.89]):.2f}"
+    arguments = (
+        f"--grid --grid.x-number {x} --grid.y-number {y} --grid.x-length {length:.2f} "
+        f"--grid.y-length {length * rng.uniform(0.85, 1.2):.2f} "
+        f"--turn-lanes 1 --turn-lanes.length {rng.uniform(30, 45):.1f} "
+        f"--perturb-x norm(0,{spread:.2f}) --perturb-y norm(0,{spread:.2f}) "
+        f"--default-junction-type {control} --default.lanenumber {rng.integers(1, 3)} "
+        f"--default.lanewidth {rng.uniform(3.2, 3.7):.2f} --default.speed {rng.choice([11.18, 13.89]):.2f} "
+        f"--default.junctions.radius {rng.uniform(5, 10):.2f} --tls.layout {_signal_layout(rng)} "
+        f"--seed {rng.integers(1, 2**30)} --output-file net.net.xml {COMMON}"
     )
-    arguments += f" --default.junctions.radius {rng.uniform(5, 10):.2f} --tls.layout {_signal_layout(rng)}"
-    arguments += f" --seed {rng.integers(1, 2**30)} --output-file net.net.xml {COMMON}"
     run_program("netgenerate", arguments, folder)
     return folder / "net.net.xml"
 
 
 def freeway(rng: np.random.Generator, folder: Path, longer: float = 0.0) -> Path:
-    """Two carriageways, each with an on-ramp and an off-ramp: apart or joined by a weaving lane.
+    """Make two carriageways, each with an on-ramp and an off-ramp: apart or joined by a weaving lane.
 
     All ends, those of the ramps too, are ``longer`` metres farther out than :data:`RAMP_RADIUS` asks for.
     """
@@ -326,53 +305,47 @@ def freeway(rng: np.random.Generator, folder: Path, longer: float = 0.0) -> Path
     # A longer road turns as much, not more.
     curvature = rng.uniform(-1, 1) / 1500 * (600 / (600 + longer))
     for side in range(2):
-        lanes = int(rng.integers(2, 4))
-        road, bend = (lanes, speed, width), curvature * (1 - 2 * side)
-        _carriageway(net, rng, side, road, direction + side * np.pi, bend, longer)
+        road, bend = (int(rng.integers(2, 4)), speed, width), curvature * (1 - 2 * side)
+        _carriageway(net, rng, f"c{side}", road, direction + side * np.pi, bend, longer)
     return net.compile(folder, "--default.junctions.radius 4 --junctions.scurve-stretch 1.5")
 
 
 def _carriageway(
     net: PlainNetwork,
     rng: np.random.Generator,
-    side: int,
-    road: tuple[int, float, float],
+    name: str,
+    road: Road,
     direction: float,
     curvature: float,
     longer: float,
 ) -> None:
-    """One direction of a freeway: base, stretch beside the on-ramp, gap, stretch beside the off-ramp, end."""
+    """Add one direction of a freeway: base, stretch beside the on-ramp, gap, stretch beside the off-ramp, end."""
     lanes, speed, width = road
     weaving = rng.random() < 0.4
     stations = np.cumsum([0, 300 + longer, rng.uniform(180, 260), 0 if weaving else rng.uniform(120, 200)])
     stations = np.append(stations, [stations[-1] + (0 if weaving else rng.uniform(130, 180))])
     stations = np.append(stations, stations[-1] + 300 + longer)
-    shift = stations[-1] / 2
-    median = 5.0
+    shift, median, spin = stations[-1] / 2, 5.0, _rotation(direction)
 
-    def along(s: NDArray[np.float64], right: float | NDArray[np.float64]) -> Point:
-        """Points at stations s, so far to the right of the edge of the median."""
+    def along(s: Doubles, right: float | Doubles) -> Doubles:
+        """Return points at stations s, so far to the right of the edge of the median."""
         u = s - shift
-        x, y = u, curvature * u**2 / 2
         normal = np.stack([curvature * u, -np.ones_like(u)], -1)
-        out = np.stack([x, y], -1) + normal * (median + np.asarray(right))[..., None]
-        spin = np.array([[np.cos(direction), -np.sin(direction)], [np.sin(direction), np.cos(direction)]])
+        out = np.stack([u, curvature * u**2 / 2], -1) + normal * (median + np.asarray(right))[..., None]
         return out @ spin.T
 
     marks = stations[[0, 1, 2, 5] if weaving else [0, 1, 2, 3, 4, 5]].tolist()
     extra = [0, 1, 0] if weaving else [0, 1, 0, 1, 0]
-    names = [f"c{side}m{k}" for k in range(len(marks))]
-    for name, mark in zip(names, marks, strict=True):
-        net.node(name, along(np.array([mark]), 0.0)[0], "priority")
+    names = [f"{name}m{k}" for k in range(len(marks))]
+    for node, mark in zip(names, marks, strict=True):
+        net.node(node, along(np.array([mark]), 0.0)[0], "priority")
     ids = []
     for k, more in enumerate(extra):
         # The line given to SUMO is the left edge of the carriageway (spread to the right).
         line = along(np.linspace(marks[k], marks[k + 1], 12), 0.0)
-        ends, total = (names[k], names[k + 1]), lanes + more
-        ids.append(net.edge(*ends, lanes=total, speed=speed, width=width, priority=9, shape=line))
+        ids.append(net.edge((names[k], names[k + 1]), line, (lanes + more, speed, width), 9))
     for k in range(len(extra) - 1):
-        pairs = [(i + extra[k], i + extra[k + 1]) for i in range(lanes)]
-        net.connect(ids[k], ids[k + 1], pairs)
+        net.connect(ids[k], ids[k + 1], [(i + extra[k], i + extra[k + 1]) for i in range(lanes)])
 
     ramp_speed, edge = rng.uniform(15.5, 20), lanes * width
     on, off = 1, len(extra) - 1
@@ -382,121 +355,44 @@ def _carriageway(
     gap = (3 * reach + 30 * reach**2) * (far / 150)
     start = along(marks[on] - far * reach, edge + gap)
     end = along(marks[off] + far * reach[::-1], edge + gap[::-1])
-    net.node(f"c{side}on", start[0], "priority")
-    net.node(f"c{side}off", end[-1], "priority")
-    ramp = partial(net.edge, lanes=1, speed=ramp_speed, width=width, priority=4)
-    first, last = ramp(f"c{side}on", names[on], shape=start), ramp(names[off], f"c{side}off", shape=end)
-    net.connect(first, ids[on], [(0, 0)])
-    net.connect(ids[off - 1], last, [(0, 0)])
-
-
-def random(rng: np.random.Generator, folder: Path) -> Path:
-    """Streets of all directions and lengths, without a grid: grown by ``netgenerate``, then built like a town's."""
-    nodes, pairs = _grown(rng, folder)
-    main = _through_road(rng, nodes, pairs)
-    width = rng.uniform(3.2, 3.7)
-    arterial = (int(rng.choice([2, 2, 3])), float(rng.choice([13.89, 15.65, 16.67])))
-    collector = (int(rng.choice([1, 1, 2])), float(rng.choice([8.94, 11.18, 13.41])))
-    links: list[_Link] = []
-    for a, b in pairs:
-        line = _street(rng, nodes, links, a, b)
-        lanes, speed = arterial if (a, b) in main else collector
-        links.append(_Link(a, b, line, (a, b) in main, lanes, min(speed, _comfortable_speed(line))))
-    return _build(rng, folder, nodes, links, width)
-
-
-def _grown(rng: np.random.Generator, folder: Path) -> tuple[Point, list[tuple[int, int]]]:
-    """Nodes [N, 2] and the two-way streets between them, from a random network; no street ends nowhere."""
-    nearest = rng.uniform(65, 85)
-    arguments = f"--rand --rand.iterations {rng.integers(25, 50)} --rand.num-tries 60 "
-    arguments += f"--rand.min-distance {nearest:.2f} --rand.max-distance {nearest * 1.8:.2f} "
-    arguments += "--rand.min-angle 65 --rand.connectivity 0.98 "
-    for arms, chance in enumerate((0, 0, 5, 10, 1, 0), start=1):
-        arguments += f"--rand.neighbor-dist{arms} {chance} "
-    arguments += f"--seed {rng.integers(1, 2**30)} --output-file grown.net.xml --plain-output-prefix grown"
-    run_program("netgenerate", arguments, folder)
-    places = {
-        node.attrib["id"]: np.array([float(node.attrib["x"]), float(node.attrib["y"])])
-        for node in ET.parse(folder / "grown.nod.xml").getroot().iter("node")  # noqa: S314
-    }
-    streets = {
-        tuple(sorted((edge.attrib["from"], edge.attrib["to"])))
-        for edge in ET.parse(folder / "grown.edg.xml").getroot().iter("edge")  # noqa: S314
-    }
-    pairs = sorted(streets)
-    while True:
-        meeting = Counter(end for pair in pairs for end in pair)
-        kept = [pair for pair in pairs if min(meeting[end] for end in pair) > 1]
-        if len(kept) == len(pairs):
-            break
-        pairs = kept
-    if len(pairs) < _FEWEST_STREETS:
-        raise DataError(f"a random network came out with {len(pairs)} streets only")
-    names = sorted(meeting)
-    return np.array([places[name] for name in names]), [(names.index(a), names.index(b)) for a, b in pairs]
-
-
-def _through_road(
-    rng: np.random.Generator, nodes: Point, pairs: list[tuple[int, int]]
-) -> set[tuple[int, int]]:
-    """Streets of an arterial: from a random one on both ways, each time into the street that bends least."""
-    first = pairs[int(rng.integers(len(pairs)))]
-    road = {first}
-    for before, here in (first, first[::-1]):
-        while True:
-            options = []
-            for pair in pairs:
-                if here in pair and pair not in road:
-                    end = pair[0] + pair[1] - here
-                    ahead, away = nodes[here] - nodes[before], nodes[end] - nodes[here]
-                    cosine = float(ahead @ away / np.linalg.norm(ahead) / np.linalg.norm(away))
-                    options.append((cosine, pair, end))
-            if not options or max(options)[0] < _THROUGH:
-                break
-            _, pair, end = max(options)
-            road.add(pair)
-            before, here = here, end  # noqa: PLW2901
-    return road
-
-
-OWN_ROADS = {".xodr": "--opendrive-files", ".osm": "--osm-files", ".net.xml": "--sumo-net-file"}
-"""Endings of road networks of one's own (OpenDRIVE, OpenStreetMap, SUMO), and how ``netconvert`` is told of them."""
+    net.node(f"{name}on", start[0], "priority")
+    net.node(f"{name}off", end[-1], "priority")
+    ramp = (1, ramp_speed, width)
+    net.connect(net.edge((f"{name}on", names[on]), start, ramp, 4), ids[on], [(0, 0)])
+    net.connect(ids[off - 1], net.edge((names[off], f"{name}off"), end, ramp, 4), [(0, 0)])
 
 
 def is_own(kind: str) -> bool:
-    """Whether a kind of network is a file of the user's."""
+    """Return whether a kind of network is a file of the user's."""
     return kind.endswith(tuple(OWN_ROADS))
 
 
 def kind_name(kind: str) -> str:
-    """A kind as part of a segment's name: of a file its own name, without folder and ending."""
-    if not is_own(kind):
-        return kind
-    ending = next(ending for ending in OWN_ROADS if kind.endswith(ending))
-    return re.sub(r"[^A-Za-z0-9_]+", "_", Path(kind).name.removesuffix(ending))
+    """Return a kind as part of a segment's name: of a file its own name, without folder and ending."""
+    for ending in OWN_ROADS:
+        if kind.endswith(ending):
+            return re.sub(r"[^A-Za-z0-9_]+", "_", Path(kind).name.removesuffix(ending))
+    return kind
 
 
 def own_network(file: Path, folder: Path) -> Path:
-    """Roads of the user's as a SUMO network, with the lanes for cars; a :class:`DataError` names the file."""
-    if not file.is_file():
-        raise DataError("no such file", file=file)
-    ending, option = next(entry for entry in OWN_ROADS.items() if file.name.endswith(entry[0]))
-    shutil.copyfile(file, folder / f"own{ending}")
-    arguments = f"{option} own{ending} --output-file net.net.xml {COMMON}"
-    arguments += " --keep-edges.by-vclass passenger --remove-edges.isolated true"
-    if ending == ".osm":
-        arguments += " --geometry.remove true --junctions.join true --tls.guess-signals true"
-    try:
+    """Return roads of the user's as a SUMO network, with the lanes for cars; a :class:`DataError` names the file."""
+    with located(file=file):
+        if not file.is_file():
+            raise DataError("no such file")
+        ending, option = next(entry for entry in OWN_ROADS.items() if file.name.endswith(entry[0]))
+        shutil.copyfile(file, folder / f"own{ending}")
+        arguments = f"{option} own{ending} --output-file net.net.xml {COMMON}"
+        arguments += " --keep-edges.by-vclass passenger --remove-edges.isolated true"
+        if ending == ".osm":
+            arguments += " --geometry.remove true --junctions.join true --tls.guess-signals true"
         run_program("netconvert", arguments, folder)
-    except DataError as error:
-        raise error.at(file=file) from error
-    return folder / "net.net.xml"
+        return folder / "net.net.xml"
 
 
 NETWORKS: dict[str, Callable[[np.random.Generator, Path], Path]] = {
     "town": town,
     "grid": grid,
     "ramp": freeway,
-    "random": random,
 }
 """Kinds of network; each function writes files into a folder and returns the path of the network."""

@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from symphony import files
 from symphony.data import store_format
@@ -22,13 +21,12 @@ from symphony.errors import DataError
 
 TIMEOUT_SECONDS = 600.0
 SCRATCH = "symphony-sumo-"
-SETTLED = 60.0
-"""Seconds after which a folder without an owner is not one that is just being made."""
+SETTLED = 60.0  # seconds after which a folder without an owner is not one that is just being made
 
 
 @contextlib.contextmanager
 def scratch() -> Iterator[Path]:
-    """A temporary folder; those that processes left which were killed are removed first."""
+    """Make a temporary folder; those that processes left which were killed are removed first."""
     for folder in Path(tempfile.gettempdir()).glob(f"{SCRATCH}*"):
         _remove_left(folder)
     with tempfile.TemporaryDirectory(prefix=SCRATCH) as name, store_format.lock(Path(name)):
@@ -49,18 +47,17 @@ def _remove_left(folder: Path) -> None:
 
 @cache
 def sumo_home() -> Path:
-    """Folder of the installed SUMO; a :class:`DataError` where it is not installed."""
+    """Return the folder of the installed SUMO; a :class:`DataError` where it is not installed."""
     spec = importlib.util.find_spec("sumo")
-    folders = [Path(p) for p in (spec.submodule_search_locations or [])] if spec is not None else []
-    for folder in folders:
-        if (folder / "bin").is_dir():
-            return folder
+    for folder in (spec.submodule_search_locations or []) if spec is not None else []:
+        if (Path(folder) / "bin").is_dir():
+            return Path(folder)
     raise DataError("SUMO is not installed; it comes with the extra: pip install 'symphony-traffic[sumo]'")
 
 
 @cache
 def sumo_version() -> str:
-    """Version of the installed SUMO, such as "1.28.0"."""
+    """Return the version of the installed SUMO, such as "1.28.0"."""
     sumo_home()
     return importlib.metadata.version("eclipse-sumo")
 
@@ -70,13 +67,17 @@ def run_program(name: str, arguments: str, folder: Path) -> None:
     home = sumo_home()
     command = [str(home / "bin" / name), *arguments.split(), "--xml-validation", "never"]
     environment = {**os.environ, "SUMO_HOME": str(home)}
-    options: Any = {"capture_output": True, "text": True, "timeout": TIMEOUT_SECONDS}
     try:
-        # The program comes from the installed wheel and the arguments are ours.
-        done = subprocess.run(command, cwd=folder, env=environment, check=False, **options)  # noqa: S603
-    except subprocess.TimeoutExpired as error:
-        raise DataError(f"{name} did not finish within {TIMEOUT_SECONDS:.0f} s") from error
-    except OSError as error:
-        raise DataError(f"{name} could not be started: {error}") from error
+        done = subprocess.run(  # noqa: S603 - the program comes from the installed wheel and the arguments are ours
+            command,
+            cwd=folder,
+            env=environment,
+            check=False,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_SECONDS,
+        )
+    except (subprocess.TimeoutExpired, OSError) as error:
+        raise DataError(f"{name} could not be run: {error}") from error
     if done.returncode != 0:
         raise DataError(f"{name} failed with exit status {done.returncode}:\n{done.stderr[-4000:].strip()}")

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET  # files are our own
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry import LineString, MultiPolygon, Point, Polygon
+from shapely.geometry import MultiPolygon, Point, Polygon
 from shapely.geometry.polygon import orient
 
 from symphony.data.levels import shares
-from symphony.data.segment import LaneType, MarkType, Polylines, RoadMap
+from symphony.data.segment import Bools, Floats, LaneType, MarkType, Polylines, RoadMap
+from symphony.data.sources.base import Doubles
+from symphony.data.sources.lines import stretches
 
-Line = NDArray[np.float64]
 _DEFAULT_WIDTH = 3.2
 _FREEWAY_SPEED = 22.0
 _APPROACH = 15.0
@@ -44,36 +46,34 @@ class Network:
         centers: [J, 2] junctions where at least three streets meet or lanes split or join.
     """
 
-    lanes: list[Line]
-    width: NDArray[np.float64]
-    speed: NDArray[np.float64]
-    internal: NDArray[np.bool_]
+    lanes: list[Doubles]
+    width: Doubles
+    speed: Doubles
+    internal: Bools
     edge: NDArray[np.int64]
     edge_names: list[str]
     successors: NDArray[np.int64]
     connectors: dict[str, list[tuple[int, int, int]]]
     stop_lanes: list[int]
-    junction_shapes: list[Line]
-    centers: Line
+    junction_shapes: list[Doubles]
+    centers: Doubles
 
     def sources(self) -> list[int]:
-        """Edges for traffic that nothing leads into."""
+        """Return the edges for traffic that nothing leads into."""
         following, _, lanes = self.edge_graph()
         entered = {edge for edges in following for edge in edges}
         return [edge for edge in range(len(lanes)) if lanes[edge] > 0 and edge not in entered]
 
-    def edge_graph(self) -> tuple[list[list[int]], NDArray[np.float64], NDArray[np.int64]]:
-        """Of the edges outside junctions: those that follow each, its length and its number of lanes.
+    def edge_graph(self) -> tuple[list[list[int]], Doubles, NDArray[np.int64]]:
+        """Return of each edge outside junctions those that follow, its length and its number of lanes.
 
         Edges inside junctions have no followers, length 0 and 0 lanes.
         """
         count = len(self.edge_names)
         following: list[set[int]] = [set() for _ in range(count)]
-        after = {}
-        for a, b in self.successors[self.internal[self.successors[:, 0]]]:
-            after[int(a)] = int(b)
-        for a, b in self.successors[~self.internal[self.successors[:, 0]]]:
-            target = int(b)
+        after = {a: b for a, b in self.successors.tolist() if self.internal[a]}
+        for a, b in self.successors[~self.internal[self.successors[:, 0]]].tolist():
+            target = b
             while self.internal[target]:
                 target = after[target]
             following[self.edge[a]].add(int(self.edge[target]))
@@ -83,35 +83,39 @@ class Network:
             lanes[self.edge[k]] += 1
         return [sorted(f) for f in following], length, lanes
 
-    def edge_headings(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Directions in radians in which each edge begins and ends, over :data:`_APPROACH` metres."""
+    def edge_headings(self) -> tuple[Doubles, Doubles]:
+        """Return the radians in which each edge begins and ends, over :data:`_APPROACH` metres."""
         first, last = np.zeros(len(self.edge_names)), np.zeros(len(self.edge_names))
         for k, line in enumerate(self.lanes):
-            for out, piece in ((first, line), (last, line[::-1])):
+            for out, piece, sign in ((first, line, 1), (last, line[::-1], -1)):
                 away = np.linalg.norm(piece - piece[0], axis=-1)
                 far = int(np.argmax(away > _APPROACH)) or len(piece) - 1
-                step = piece[far] - piece[0] if out is first else piece[0] - piece[far]
+                step = sign * (piece[far] - piece[0])
                 out[self.edge[k]] = np.arctan2(step[1], step[0])
         return first, last
 
-    def edge_speed(self) -> NDArray[np.float64]:
-        """Speed limit per edge."""
+    def edge_speed(self) -> Doubles:
+        """Return the speed limit per edge."""
         speed = np.zeros(len(self.edge_names))
         np.maximum.at(speed, self.edge, self.speed)
         return speed
 
 
-def _shape(text: str) -> Line:
+def _shape(text: str) -> Doubles:
     return np.array([[float(c) for c in p.split(",")[:2]] for p in text.split()])
 
 
 def read_network(file: Path) -> Network:
     """Read a compiled network (``.net.xml``)."""
     root = ET.parse(file).getroot()  # noqa: S314
-    lanes: list[Line] = []
+    lanes: list[Doubles] = []
     width, speed, internal, edge, names = [], [], [], [], []
     index: dict[str, int] = {}
+    balance: Counter[str] = Counter()
     for element in root.iter("edge"):
+        if element.get("function") is None:
+            balance.update({element.attrib["from"]: -1})
+            balance.update({element.attrib["to"]: 1})
         if element.get("function") in {"crossing", "walkingarea"}:
             continue
         names.append(element.attrib["id"])
@@ -122,24 +126,27 @@ def read_network(file: Path) -> Network:
             speed.append(float(lane.attrib["speed"]))
             internal.append(element.get("function") == "internal")
             edge.append(len(names) - 1)
-    successors, stops = [], []
+    successors, stops = set(), set()
     connectors: dict[str, list[tuple[int, int, int]]] = {}
     for link in root.iter("connection"):
         start = index[f"{link.attrib['from']}_{link.attrib['fromLane']}"]
         end = index[f"{link.attrib['to']}_{link.attrib['toLane']}"]
         via = index[link.attrib["via"]] if "via" in link.attrib else end
-        successors.append((start, via))
+        successors.add((start, via))
         if "tl" in link.attrib:
             connectors.setdefault(link.attrib["tl"], []).append((int(link.attrib["linkIndex"]), via, start))
         if link.get("state") in {"s", "w"}:
-            stops.append(edge.index(edge[start]))
-    shapes, centers, meeting = [], [], _meeting_points(root)
+            stops.add(edge.index(edge[start]))
+    shapes, centers = [], []
     for junction in root.iter("junction"):
-        if junction.get("type") == "internal" or len(_shape(junction.get("shape", ""))) < 3:
+        shape = _shape(junction.get("shape", ""))
+        if junction.get("type") == "internal" or len(shape) < 3:
             continue
-        shapes.append(_shape(junction.attrib["shape"]))
-        if junction.attrib["id"] in meeting:
-            centers.append(shapes[-1].mean(0))
+        shapes.append(shape)
+        # Where streams of traffic cross, split or join. Sources and sinks are out of balance, but have no shape.
+        crossing = any("1" in request.attrib["foes"] for request in junction.iter("request"))
+        if crossing or balance[junction.attrib["id"]] != 0:
+            centers.append(shape.mean(0))
     return Network(
         lanes,
         np.array(width),
@@ -147,28 +154,12 @@ def read_network(file: Path) -> Network:
         np.array(internal),
         np.array(edge),
         names,
-        np.array(sorted(set(successors)), dtype=np.int64).reshape(-1, 2),
+        np.array(sorted(successors), dtype=np.int64).reshape(-1, 2),
         connectors,
-        sorted(set(stops)),
+        sorted(stops),
         shapes,
         np.array(centers).reshape(-1, 2),
     )
-
-
-def _meeting_points(root: ET.Element) -> set[str]:
-    """Ids of the junctions where streams of traffic cross, split or join."""
-    balance: dict[str, int] = {}
-    for edge in root.iter("edge"):
-        if edge.get("function") is None:
-            for end, sign in (("from", -1), ("to", 1)):
-                balance[edge.attrib[end]] = balance.get(edge.attrib[end], 0) + sign
-    crossing = {
-        junction.attrib["id"]
-        for junction in root.iter("junction")
-        if any("1" in request.attrib["foes"] for request in junction.iter("request"))
-    }
-    # Sources and sinks have an imbalance too, but no junction shape of at least three points.
-    return crossing | {name for name, count in balance.items() if count != 0}
 
 
 @dataclass(frozen=True)
@@ -185,14 +176,14 @@ class Crop:
     """
 
     road: RoadMap
-    center: Line
+    center: Doubles
     signals: list[tuple[str, int]]
     signal_lane: NDArray[np.int32]
-    signal_point: NDArray[np.float32]
+    signal_point: Floats
     drivable: Polygon | MultiPolygon
 
 
-def crop_network(network: Network, center: Line, radius: float) -> Crop:
+def crop_network(network: Network, center: Doubles, radius: float) -> Crop:
     """Cut the map within ``radius`` metres of a point.
 
     Lanes are cut where they first enter and last leave the circle; connectors that touch it may reach beyond, as
@@ -206,39 +197,40 @@ def crop_network(network: Network, center: Line, radius: float) -> Crop:
         if network.internal[k] and away.min() <= radius:
             reach = radius + BOUNDARY_MARGIN - 2 * _BOUNDARY_SPACING
         inside = np.flatnonzero(away <= reach)
-        first, last = (inside[0], inside[-1]) if len(inside) else (0, -1)
-        if last - first < 1:
+        if len(inside) == 0 or inside[-1] == inside[0]:
             continue
         kept.append(k)
-        lines.append(local[first : last + 1])
-        whole_start.append(first == 0)
-        whole_end.append(last == len(local) - 1)
+        lines.append(local[inside[0] : inside[-1] + 1])
+        whole_start.append(inside[0] == 0)
+        whole_end.append(inside[-1] == len(local) - 1)
     place = np.full(len(network.lanes), -1)
     place[kept] = np.arange(len(kept))
     pairs = place[network.successors]
     pairs = pairs[(pairs >= 0).all(1)]
     pairs = pairs[np.array(whole_end)[pairs[:, 0]] & np.array(whole_start)[pairs[:, 1]]]
     drivable = _drivable(network, center, radius + BOUNDARY_MARGIN)
-    left = _left_neighbors(network, np.array(kept))
+    # Lanes of one edge follow each other from right to left; connectors have no neighbours.
+    same = (network.edge[kept[:-1]] == network.edge[kept[1:]]) & (np.diff(kept) == 1)
+    right = np.flatnonzero(same & ~network.internal[kept[:-1]])
+    left = np.stack([right, right + 1], -1).astype(np.int32)
     ends = {k: lines[i][-1] for i, k in enumerate(kept) if whole_end[i]}
     marks = [_beside(lines[place[k]], network.width[k]) for k in network.stop_lanes if k in ends]
+    kinds = np.where(network.speed[kept] > _FREEWAY_SPEED, LaneType.FREEWAY, LaneType.SURFACE_STREET)
     road = RoadMap(
         lanes=Polylines.of(lines),
         lane_id=np.array(kept, np.int64),
-        lane_type=np.where(
-            network.speed[kept] > _FREEWAY_SPEED, LaneType.FREEWAY, LaneType.SURFACE_STREET
-        ).astype(np.uint8),
+        lane_type=kinds.astype(np.uint8),
         speed_limit=network.speed[kept].astype(np.float32),
         lane_width=network.width[kept].astype(np.float32),
         successors=pairs.astype(np.int32),
-        left_neighbors=left.astype(np.int32),
-        right_neighbors=left[:, ::-1].astype(np.int32),
+        left_neighbors=left,
+        right_neighbors=left[:, ::-1],
         boundary=Polylines.of(_boundary(drivable, radius + BOUNDARY_MARGIN)),
         marks=Polylines.of(marks),
         mark_type=np.full(len(marks), MarkType.STOP_SIGN, np.uint8),
     )
     controlled = [
-        (light, number, place[via], network.lanes[start][-1] - center)
+        ((light, number), place[via], network.lanes[start][-1] - center)
         for light, links in sorted(network.connectors.items())
         for number, via, start in sorted(links)
         if place[via] >= 0 and start in ends
@@ -246,15 +238,15 @@ def crop_network(network: Network, center: Line, radius: float) -> Crop:
     return Crop(
         road,
         center,
-        [(light, number) for light, number, _, _ in controlled],
-        np.array([lane for _, _, lane, _ in controlled], np.int32),
+        [signal for signal, _, _ in controlled],
+        np.array([lane for _, lane, _ in controlled], np.int32),
         np.array([[*point, 0] for *_, point in controlled], np.float32).reshape(-1, 3),
         drivable,
     )
 
 
-def _densify(line: Line, spacing: float) -> Line:
-    """Points at most ``spacing`` apart at equal arc lengths; the ends stay."""
+def _densify(line: Doubles, spacing: float) -> Doubles:
+    """Return points at most ``spacing`` apart at equal arc lengths; the ends stay."""
     step = np.linalg.norm(np.diff(line, axis=0), axis=-1)
     keep = np.concatenate([[True], step > 1e-6])
     line, at = line[keep], np.concatenate([[0.0], np.cumsum(step[keep[1:]])])
@@ -264,23 +256,16 @@ def _densify(line: Line, spacing: float) -> Line:
     return np.stack([np.interp(s, at, line[:, 0]), np.interp(s, at, line[:, 1])], -1)
 
 
-def _left_neighbors(network: Network, kept: NDArray[np.int64]) -> NDArray[np.int64]:
-    """[E, 2] pairs (lane, lane on its left) outside junctions, as positions in ``kept``."""
-    same = (network.edge[kept[:-1]] == network.edge[kept[1:]]) & (np.diff(kept) == 1)
-    right = np.flatnonzero(same & ~network.internal[kept[:-1]])
-    return np.stack([right, right + 1], -1)
-
-
-def _beside(line: Line, width: float) -> Line:
-    """[1, 2] where a sign stands: right of the end of a lane."""
+def _beside(line: Doubles, width: float) -> Doubles:
+    """Return [1, 2] where a sign stands: right of the end of a lane."""
     along = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
     return (line[-1] + np.array([along[1], -along[0]]) * (width / 2 + 0.5))[None]
 
 
-def _drivable(network: Network, center: Line, radius: float) -> Polygon | MultiPolygon:
-    """Union of lanes and junctions that reach into the circle; correct inside it, ragged beyond."""
+def _drivable(network: Network, center: Doubles, radius: float) -> Polygon | MultiPolygon:
+    """Return the union of lanes and junctions that reach into the circle; correct inside it, ragged beyond."""
     circle = Point(0, 0).buffer(radius + 20)
-    lines = np.array([LineString(line - center) for line in network.lanes], dtype=object)
+    lines = np.array([shapely.LineString(line - center) for line in network.lanes], dtype=object)
     near = shapely.intersects(lines, circle)
     strips = shapely.buffer(
         lines[near], network.width[near] / 2, cap_style="flat", join_style="mitre", mitre_limit=2.0
@@ -291,33 +276,22 @@ def _drivable(network: Network, center: Line, radius: float) -> Polygon | MultiP
     return union.buffer(_SLIT, join_style="mitre").buffer(-_SLIT, join_style="mitre")
 
 
-def _boundary(area: Polygon | MultiPolygon, radius: float) -> list[Line]:
-    """Rings of the area inside the circle, drivable side on the left; rings that leave it become open lines."""
-    lines: list[Line] = []
-    parts = area.geoms if isinstance(area, MultiPolygon) else [area]
-    for part in parts:
+def _boundary(area: Polygon | MultiPolygon, radius: float) -> list[Doubles]:
+    """Return rings of the area inside the circle, drivable side on the left; what leaves it is open."""
+    lines: list[Doubles] = []
+    for part in shapely.get_parts(area):
         simple = orient(part.simplify(_BOUNDARY_TOLERANCE))
         for ring in (simple.exterior, *simple.interiors):
-            if ring.is_empty or Polygon(ring).area < 1.0:
-                continue
-            points = _subdivide(np.asarray(ring.coords)[:, :2], _BOUNDARY_SPACING)
-            lines += _runs(points, np.linalg.norm(points, axis=-1) <= radius)
+            if not ring.is_empty and Polygon(ring).area >= 1.0:
+                points = _subdivide(np.asarray(ring.coords)[:, :2], _BOUNDARY_SPACING)
+                inside = np.linalg.norm(points, axis=-1) <= radius
+                lines += stretches(points, inside[:-1] & inside[1:])
     return lines
 
 
-def _subdivide(line: Line, spacing: float) -> Line:
-    """The same line with points added so that none are further apart than ``spacing``; vertices stay."""
+def _subdivide(line: Doubles, spacing: float) -> Doubles:
+    """Return the same line with points added so that none are further apart than ``spacing``; vertices stay."""
     step = np.linalg.norm(np.diff(line, axis=0), axis=-1)
     count = np.maximum(1, np.ceil(step / spacing)).astype(int)
     start = np.repeat(np.arange(len(step)), count)
     return np.concatenate([line[start] + shares(count)[:, None] * np.diff(line, axis=0)[start], line[-1:]])
-
-
-def _runs(ring: Line, inside: NDArray[np.bool_]) -> list[Line]:
-    """Stretches of a closed ring of at least two points that are inside."""
-    if inside.all():
-        return [ring]
-    shift = int(np.argmin(inside))
-    ring, inside = np.roll(ring[:-1], -shift, axis=0), np.roll(inside[:-1], -shift)
-    change = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
-    return [ring[a:b] for a, b in zip(change[::2], change[1::2], strict=True) if b - a >= 2]

@@ -1,0 +1,260 @@
+"""Traffic: a mix of drivers and bodies on random walks through a network, simulated by SUMO into smooth tracks."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET  # files are our own
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symphony.data.segment import Bools, Floats, SignalState
+from symphony.data.sources.base import Doubles
+from symphony.data.sources.sumo.process import run_program
+from symphony.data.sources.sumo.roads import Network
+from symphony.errors import DataError
+
+# Share, (least, most) length, width and height in metres, SUMO's vehicle class.
+_BODIES = (
+    (0.78, (4.0, 5.1), (1.72, 1.95), (1.4, 1.8), "passenger"),
+    (0.12, (5.2, 6.2), (1.95, 2.1), (2.0, 2.6), "delivery"),
+    (0.07, (7.0, 9.5), (2.2, 2.45), (2.8, 3.6), "truck"),
+    (0.03, (10.5, 12.0), (2.45, 2.55), (3.0, 3.4), "bus"),
+)
+_DRIVERS = ("IDM", "EIDM", "Krauss")
+TYPES = 24
+ROUTES = "traffic.rou.xml"
+_STRAIGHT = 0.6  # radians between two streets up to which one goes on as the other
+DEPART_WITHIN = 15.0  # seconds in which the vehicles of a closed network enter it
+STEP = 0.1  # seconds per simulation step and per recorded position
+_SIGMA, _REACH = 0.25, 8
+"""Seconds, and samples on either side, of the smoothing kernel; tracks lose as many at both ends."""
+_FRONT_OVERHANG, _REAR_OVERHANG = 0.19, 0.22
+"""Distance of the axles from the ends of the box, as shares of its length."""
+_STATES = {
+    **dict.fromkeys("ru", SignalState.STOP),
+    **dict.fromkeys("yY", SignalState.CAUTION),
+    **dict.fromkeys("gG", SignalState.GO),
+    "s": SignalState.FLASHING_STOP,
+    "o": SignalState.FLASHING_CAUTION,
+    "O": SignalState.UNKNOWN,
+}
+"""SUMO's letters for the state of a light."""
+
+
+def _types(rng: np.random.Generator, sublane: bool) -> tuple[list[str], Floats, Doubles]:
+    """Return XML, boxes [TYPES, 3] and shares [TYPES] of the vehicle types."""
+    # At least one type per body, so that a run's mix has all of them.
+    bodies = np.concatenate([np.arange(len(_BODIES)), rng.choice([0, 0, 0, 0, 1, 2], TYPES - len(_BODIES))])
+    counts = np.bincount(bodies, minlength=len(_BODIES))
+    lines, sizes, shares = [], [], []
+    for k, body in enumerate(bodies):
+        share, *ranges, name = _BODIES[body]
+        size = [rng.uniform(*each) for each in ranges]
+        heavy = 0.75 if body >= 2 else 1.0
+        tau = float(np.clip(rng.normal(1.3, 0.3), 0.9, 2.2))
+        extra = ' latAlignment="center" maxSpeedLat="0.8"' if sublane else ""
+        lines.append(
+            f'<vType id="t{k}" vClass="{name}" length="{size[0]:.2f}" width="{size[1]:.2f}" '
+            f'height="{size[2]:.2f}" carFollowModel="{rng.choice(_DRIVERS)}" sigma="{rng.uniform(0.1, 0.5):.2f}" '
+            f'speedFactor="normc(0.98,0.08,0.6,1.3)" tau="{tau:.2f}" accel="{heavy * rng.uniform(1.6, 2.9):.2f}" '
+            f'decel="{rng.uniform(2.8, 4.2):.2f}" minGap="{rng.uniform(1.6, 3.2):.2f}"{extra}/>'
+        )
+        sizes.append(np.round(size, 2))
+        shares.append(share / counts[body])
+    return lines, np.asarray(sizes, np.float32), np.asarray(shares) / np.sum(shares)
+
+
+def write_demand(
+    network: Network,
+    rng: np.random.Generator,
+    folder: Path,
+    duration: float,
+    *,
+    through: bool,
+    sublane: bool,
+    straight: float = 1.0,
+) -> Floats:
+    """Write vehicle types and vehicles, with routes that last for so many seconds, into the file :data:`ROUTES`.
+
+    If ``through``, traffic enters at the sources of the network during the whole run and leaves it at the end; else a
+    fixed number of vehicles starts everywhere and circulates. A route is a random walk that goes straight on at a
+    junction so many times likelier than it takes one of the turns. Returns of vehicle k (its id in SUMO) the box [3].
+    """
+    types, sizes, shares = _types(rng, sublane)
+    following, length, lanes = network.edge_graph()
+    speed = float(network.edge_speed().max())
+    chance: list[Doubles] = []
+    if straight != 1.0:
+        first, last = network.edge_headings()
+        for edge, after in enumerate(following):
+            turn = np.abs(np.angle(np.exp(1j * (first[after] - last[edge]))))
+            weight = np.where(turn < _STRAIGHT, straight, 1.0)
+            chance.append(weight / weight.sum() if len(after) else weight)
+    if through:
+        # Each lane carries 600-1 300 vehicles per hour.
+        departs, starts = [], []
+        for edge in network.sources():
+            flow = lanes[edge] * rng.uniform(600, 1300) / 3600
+            times = np.cumsum(rng.exponential(1 / flow, int(flow * duration * 1.5) + 5))
+            departs += times[times < duration].tolist()
+            starts += [edge] * int((times < duration).sum())
+        place = 'departPos="base" departLane="best" departSpeed="avg"'
+    else:
+        weight = lanes * length
+        count = max(8, round(float(weight.sum()) / 1000 * rng.uniform(6, 15)))
+        departs = rng.uniform(0, DEPART_WITHIN, count).tolist()
+        starts = rng.choice(len(length), count, p=weight / weight.sum()).tolist()
+        place = 'departPos="random_free" departLane="best" departSpeed="speedLimit"'
+    order = np.argsort(departs, kind="stable")
+    kinds = rng.choice(TYPES, len(order), p=shares)
+    lines = ["<routes>", *types]
+    for k, i in enumerate(order):
+        at = starts[i]
+        route, total = [at], float(length[at])
+        while total < (duration - departs[i] + 30) * speed and following[at]:
+            pick = rng.choice(following[at], p=chance[at]) if chance else None
+            at = following[at][int(rng.integers(len(following[at])))] if pick is None else int(pick)
+            route.append(at)
+            total += float(length[at])
+        edges = " ".join(network.edge_names[e] for e in route)
+        lines.append(
+            f'<vehicle id="{k}" type="t{kinds[k]}" depart="{departs[i]:.2f}" {place}>'
+            f'<route edges="{edges}"/></vehicle>'
+        )
+    (folder / ROUTES).write_text("\n".join([*lines, "</routes>"]))
+    return sizes[kinds]
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Tracks of all V vehicles and all lights at N times, in the network's frame.
+
+    Attributes:
+        size: [V, 3] boxes.
+        position: [V, N, 2] box centres; NaN where the vehicle is absent.
+        heading: [V, N] unwrapped along time; NaN where absent.
+        velocity: [V, N, 2] m/s; NaN where absent.
+        present: [V, N] bool.
+        lights: per traffic light, [links, N] uint8 :class:`SignalState`.
+    """
+
+    size: Floats
+    position: Doubles
+    heading: Doubles
+    velocity: Doubles
+    present: Bools
+    lights: dict[str, NDArray[np.uint8]]
+
+
+def simulate_traffic(
+    network_file: Path,
+    network: Network,
+    size: Floats,
+    rng: np.random.Generator,
+    duration: float,
+    warm_up: float,
+    *,
+    sublane: bool,
+) -> Traffic:
+    """Simulate what :func:`write_demand` wrote, record from ``warm_up`` to ``duration`` seconds and smooth.
+
+    Vehicles keep a lateral offset of their own from the centre of the lane that drifts with the distance driven.
+    """
+    folder = network_file.parent
+    events = [
+        f'<timedEvent type="SaveTLSSwitchStates" source="{light}" dest="lights{k}.xml"/>'
+        for k, light in enumerate(network.connectors)
+    ]
+    (folder / "lights.add.xml").write_text("\n".join(["<additional>", *events, "</additional>"]))
+    arguments = (
+        f"--net-file {network_file.name} --route-files {ROUTES} --additional-files lights.add.xml "
+        f"--end {duration:.1f} --step-length {STEP} --step-method.ballistic true --seed {rng.integers(2**30)} "
+        "--extrapolate-departpos true --time-to-teleport -1 --precision 4 --collision.action warn "
+        "--collision.check-junctions true --collision.mingap-factor 0 --no-step-log true --no-warnings true "
+        f"--duration-log.disable true --device.fcd.begin {warm_up:.1f} --fcd-output tracks.csv "
+        "--fcd-output.attributes x,y,angle --fcd-output.skip-empty true "
+    )
+    arguments += "--lateral-resolution 0.5" if sublane else "--lanechange.duration 3"
+    run_program("sumo", arguments, folder)
+    time = warm_up + STEP * np.arange(round((duration - warm_up) / STEP), dtype=np.float64)
+    front, angle = _read_tracks(folder / "tracks.csv", time, len(size))
+    position, heading = _smooth(front, angle, size[:, :1].astype(np.float64), _wander(rng, len(size)))
+    velocity = np.gradient(position, STEP, axis=1)
+    # At both ends of a track the difference is with an absent neighbour.
+    present = np.asarray(np.isfinite(velocity).all(axis=-1))
+    lights = {
+        light: _read_lights(folder / f"lights{k}.xml", time) for k, light in enumerate(network.connectors)
+    }
+    return Traffic(size, position, heading, velocity, present, lights)
+
+
+def _read_tracks(file: Path, time: Doubles, count: int) -> tuple[Doubles, Doubles]:
+    """Return front bumper [V, N, 2] and heading [V, N], NaN where absent."""
+    front, heading = np.full((count, len(time), 2), np.nan), np.full((count, len(time)), np.nan)
+    with file.open() as lines:
+        header = lines.readline().strip().split(";")
+        names = ("timestep_time", "vehicle_id", "vehicle_x", "vehicle_y", "vehicle_angle")
+        table = np.loadtxt(lines, delimiter=";", usecols=[header.index(name) for name in names], ndmin=2)
+    if len(table) == 0:
+        raise DataError("no vehicle drove in the recorded time", file=file.name)
+    step, vehicle = np.rint((table[:, 0] - time[0]) / STEP).astype(int), table[:, 1].astype(int)
+    inside = (step >= 0) & (step < len(time))
+    step, vehicle, table = step[inside], vehicle[inside], table[inside]
+    front[vehicle, step] = table[:, 2:4]
+    heading[vehicle, step] = np.pi / 2 - np.deg2rad(table[:, 4])
+    return front, heading
+
+
+def _wander(rng: np.random.Generator, count: int) -> Doubles:
+    """Return [4, V, 4] constants of a sideways drift: amplitude, wave number and phase of four waves, and a bias."""
+    amplitude = rng.normal(0, 0.09, (count, 4)).clip(-0.18, 0.18)
+    number = 2 * np.pi / rng.uniform(40, 140, (count, 4))
+    bias = np.repeat(rng.normal(0, 0.08, (count, 1)).clip(-0.16, 0.16), 4, axis=1) / 4
+    return np.stack([amplitude, number, rng.uniform(0, 2 * np.pi, (count, 4)), bias])
+
+
+def _smooth(front: Doubles, heading: Doubles, length: Doubles, wander: Doubles) -> tuple[Doubles, Doubles]:
+    """Return box centre [V, N, 2] and unwrapped heading [V, N] from the smoothed paths of both axles."""
+    along = np.stack([np.cos(heading), np.sin(heading)], -1)
+    left = np.stack([-along[..., 1], along[..., 0]], -1)
+    step = np.nan_to_num(np.linalg.norm(np.diff(front, axis=1), axis=-1))
+    travelled = np.pad(np.cumsum(step, axis=1), ((0, 0), (1, 0)))
+    at_front, at_rear = length * _FRONT_OVERHANG, length * (1 - _REAR_OVERHANG)
+    amplitude, number, phase, bias = wander[:, :, :, None]
+    axles = []
+    for back in (at_front, at_rear):
+        sideways = (amplitude * np.cos(number * (travelled - back)[:, None] + phase) + bias).sum(1)
+        axles.append(_gaussian(front - back[..., None] * along + sideways[..., None] * left))
+    ahead = axles[0] - axles[1]
+    ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
+    center = axles[0] + (at_front - length / 2)[..., None] * ahead
+    angle = np.arctan2(ahead[..., 1], ahead[..., 0])
+    turn = np.nan_to_num((np.diff(angle, axis=1) + np.pi) % (2 * np.pi) - np.pi)
+    start = np.nan_to_num(angle[np.arange(len(angle)), np.argmax(np.isfinite(angle), axis=1)])
+    unwrapped = start[:, None] + np.pad(np.cumsum(turn, axis=1), ((0, 0), (1, 0)))
+    return center, np.where(np.isfinite(angle), unwrapped, np.nan)
+
+
+def _gaussian(paths: Doubles) -> Doubles:
+    """Smooth [V, N, 2] along N; samples closer than the kernel to an absent one become NaN."""
+    kernel = np.exp(-0.5 * (np.arange(-_REACH, _REACH + 1) * STEP / _SIGMA) ** 2)
+    kernel /= kernel.sum()
+    out = np.full_like(paths, np.nan)
+    inner = out[:, _REACH : paths.shape[1] - _REACH]
+    if inner.shape[1] > 0:
+        inner[:] = 0
+        for shift, weight in enumerate(kernel):
+            inner += weight * paths[:, shift : shift + inner.shape[1]]
+    return out
+
+
+def _read_lights(file: Path, time: Doubles) -> NDArray[np.uint8]:
+    """Return [links, N] states of one traffic light from its switches."""
+    switches = [(float(e.attrib["time"]), e.attrib["state"]) for e in ET.parse(file).getroot()]  # noqa: S314
+    states = np.array(
+        [[_STATES.get(letter, SignalState.UNKNOWN) for letter in state] for _, state in switches], np.uint8
+    )
+    at = np.searchsorted([t for t, _ in switches], time + 1e-6, side="right") - 1
+    return states[at.clip(0)].T.copy()
