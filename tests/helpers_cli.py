@@ -18,15 +18,16 @@ from symphony import cli
 def words() -> list[str]:
     """A line for each argument of each command, as its help shows it."""
     with mock.patch.dict(os.environ, {"COLUMNS": "110"}):  # no wider, or boxes stand beside one another
-        return [" ".join([*command, word]) for command in _commands(cli.app) for word in _told(command)]
+        return [" ".join([*command, word]) for command in commands() for word in _told(command)]
 
 
-def _commands(app: SubcommandApp, *before: str) -> Iterator[tuple[str, ...]]:
+def commands(app: SubcommandApp = cli.app, *before: str) -> list[tuple[str, ...]]:
+    """The words of every command."""
+    found: list[tuple[str, ...]] = []
     for name, given in app._subcommands.items():
-        if isinstance(given.target, SubcommandApp):
-            yield from _commands(given.target, *before, name)
-        else:
-            yield *before, name
+        group = isinstance(given.target, SubcommandApp)
+        found += commands(given.target, *before, name) if group else [(*before, name)]
+    return found
 
 
 def _told(command: tuple[str, ...]) -> Iterator[str]:
@@ -36,7 +37,9 @@ def _told(command: tuple[str, ...]) -> Iterator[str]:
     for line in shown.getvalue().splitlines():
         if re.match(r" \w", line):
             title = line.split()[0]
-        elif (found := re.match(r"  (\S.*?)(  |$)", line)) and (title == "positional" or found[1][0] == "-"):
+        elif found := re.match(
+            r"  (\S.*?)(  |$)" if title == "positional" else r"  (--?[a-z].*?)(  |$)", line
+        ):
             names = re.findall(r"(?<!\S)--?[a-z][\w.-]*", found[1]) or [found[1]]
             if names[0] != "-h":
                 yield ", ".join(names)

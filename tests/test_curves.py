@@ -15,7 +15,6 @@ from hypothesis.extra.numpy import arrays
 from matplotlib.axes import Axes
 
 from symphony.cli import main
-from symphony.cli.plot import run_names
 from symphony.errors import ConfigError
 from symphony.render import plot_curves
 from symphony.render.curves import DASHES, PANELS, panels_of, read_curves, run_colors, smoothed
@@ -137,19 +136,10 @@ def test_the_command_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["plot", "curves", one, two, "--out", out, "--metrics", "auc", "accuracy"]) == 0
     assert Path(out).stat().st_size > 5_000
     for words, expected in (
-        ([], "no runs given"),
         (["nowhere"], "is no run"),
-        ([str(fresh)], "no metrics recorded yet"),
-        ([one, one], "given twice"),
+        ([str(fresh)], "no metrics to draw"),
         ([one, "--metrics", "auk"], "no run has auk"),
-        ([one, "--window", "2"], "--window must be from 0 to 1"),
+        ([one, "--window", "2"], "from 0 to 1"),
     ):
-        assert main(["plot", "curves", *words, "--out", out]) in {1, 2}
+        assert main(["plot", "curves", *words, "--out", out]) == 1
         assert expected in capsys.readouterr().err
-
-
-def test_runs_are_named_by_what_tells_them_apart() -> None:
-    assert run_names((Path("out/a"), Path("out/b"))) == ["a", "b"]
-    assert run_names((Path("out/a/0"), Path("out/b/0"))) == ["a/0", "b/0"]
-    with pytest.raises(ConfigError, match="given twice"):
-        run_names((Path("out/a"), Path("out/b/../a")))

@@ -277,10 +277,6 @@ def test_a_killed_run_is_continued_and_workers_change_nothing(
     assert written["checksum"] == whole.checksum()
     assert written["generation"]["accepted"] == state.accepted
     assert written["generation"]["reasons"] == state.reasons
-    assert store.report["quality"] == written["quality"]
-    # Once more, with the measures that are kept.
-    monkeypatch.setattr("symphony.cli.data.measured", None)
-    assert main(command[3:]) == 0
     assert main([*command[3:], "--interactive", "3"]) == 1
     assert "interactive 2, not 3" in capsys.readouterr().err
 

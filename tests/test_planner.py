@@ -308,7 +308,7 @@ def test_the_command_simulates_reports_and_shows(
     monkeypatch.syspath_prepend(tmp_path)
     words = f"--data {store} --out sim --rollouts 2 --search none --duration 2".split()
     assert main(["simulate", AGENT, "--planner", "mine:Planner", *words]) == 0
-    assert "4 of 6 runs failed, the first: crossing-0, step 5: " in capsys.readouterr().out
+    assert "4 of 6 runs failed, the first: crossing-0, step 5: " in capsys.readouterr().err
     found = report(load_rollouts("sim"), "ego")
     assert (found.totals()["runs"], found.totals()["failed_runs"]) == (6, 4)
     assert found.agent == f"mine:Planner among {AGENT}"

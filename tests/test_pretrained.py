@@ -301,7 +301,7 @@ def test_one_process_says_where_the_agent_is(
     monkeypatch.delenv("RANK", raising=False)
     if rank is not None:
         monkeypatch.setenv("RANK", rank)
-    Train(tiny("bc", store, tmp_path / "run", steps=1)).run()
+    Train(config=tiny("bc", store, tmp_path / "run", steps=1))()
     assert capsys.readouterr().out.count("trained agent ") == lines
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -22,14 +23,14 @@ from symphony.agents.checkpoint import checkpoints
 from symphony.config import EvaluateConfig, PreviewConfig, TrainConfig, ValidationConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.scene import scene
-from symphony.errors import DataError
+from symphony.errors import ConfigError, DataError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
 from symphony.render import Clip
 from symphony.rollouts.driving import playback, simulate_batch
 from symphony.rollouts.unroll import Rollouts
 from symphony.training.hooks import QUANTILES, ROLLOUTS, quantiles, samples_of
-from symphony.training.logging import read_metrics
+from symphony.training.logging import Tracker, read_metrics
 
 MOTIONS = ("speed", "acceleration", "turn")
 
@@ -275,3 +276,30 @@ def test_a_full_disk_is_named(store: Path, tmp_path: Path) -> None:
     (settings.out / "media").touch()
     with pytest.raises(DataError, match=r"rollout-000002\.gif"):
         train(settings)
+
+
+def test_a_run_is_named_once_at_weights_and_biases_and_its_variables_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import wandb
+
+    told: list[dict[str, Any]] = []
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    monkeypatch.setattr(wandb, "init", lambda **given: told.append(given))
+    for after in (0, 3, 0):  # the second goes on
+        Tracker(tmp_path, {}, "offline", after=after).close()
+        monkeypatch.setenv("WANDB_PROJECT", "mine")
+    assert [given["project"] for given in told] == ["symphony", "mine", "mine"]
+    assert not {"group", "tags"} & told[0].keys()  # else its own variables would not be looked at
+    assert [given["resume"] for given in told] == [None, "allow", None]
+    assert told[0]["id"] == told[1]["id"] != told[2]["id"]
+    (tmp_path / "wandb-id").write_text("../other\n")
+    Tracker(tmp_path, {}, "offline", after=3).close()
+    assert re.fullmatch(r"[0-9a-f]{8}", told[3]["id"])
+
+    def init(**given: Any) -> None:
+        raise wandb.errors.UsageError("No API key configured.\nUse `wandb login` to log in.")
+
+    monkeypatch.setattr(wandb, "init", init)
+    with pytest.raises(ConfigError, match=r"^Weights & Biases: No API key .*log in\. .*--wandb offline$"):
+        Tracker(tmp_path, {}, "online")

@@ -358,7 +358,7 @@ def test_the_command_writes_page_numbers_and_table(
     free = driving((0, 0, 0, 7), (10, 0, 0, 7), segment_id="free", agent_type=types)
     save_rollouts(tmp_path / "sim", ABOUT, [played(hit), played(free)])
     assert main(["report", str(tmp_path / "sim")]) == 0
-    assert re.search(r"max_jerk +│ 0\.00 ", capsys.readouterr().out)
+    assert re.search(r"max_jerk +0\.00 ", capsys.readouterr().out)
     found = json.loads((tmp_path / "sim" / "report.json").read_text())
     wanted = {
         "runs": 2,

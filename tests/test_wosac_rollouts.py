@@ -249,7 +249,7 @@ def test_submission_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFi
     for agent, more, text in (
         ("playback", (), "playback"),
         (AGENT, ("--shards", "2"), "don't fill 2 shards"),
-        (AGENT, ("--logged-goals",), "must not know the routes of the log"),
+        (AGENT, ("--logged-goals",), "must not know the log"),
         (AGENT, ("--horizon", "5"), "a submission has 8 s"),
     ):
         assert main(["wosac", "submit", agent, "--data", str(data), "--out", str(out), *META, *more]) != 0

@@ -509,8 +509,9 @@ def _read_rollouts(folder: Path, file: str) -> tuple[str, str]:
             if not np.isfinite(saved.state[there]).all() or np.abs(saved.state[there]).max(initial=0) > 1e5:
                 return ABSURD, "a state that nobody can be in"
         if one_in(REPORTED, folder):
-            report(found).plain()
-            write_view(found, folder / "view.html")
+            told = report(found)
+            told.plain()
+            write_view(found, told, folder / "view.html")
         RolloutWriter(place, found.about)
     except DataError:
         return REFUSED, ""

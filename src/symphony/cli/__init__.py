@@ -1,43 +1,27 @@
 """The ``symphony`` command: what it offers, and how it ends.
 
-Modules of this package import nothing heavy at the top, so that ``--help`` answers at once; each command
-imports what it needs when it runs.
+Modules of this package import nothing heavy at the top, so that ``--help`` answers at once; each command imports
+what it needs when it runs. A command is a class with the name of its module; modules of `GROUPS` have several.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import signal
 import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
-from typing import Any, TextIO, get_type_hints
+from typing import Any, get_type_hints
 
 import tyro
 
 from symphony import allocator
 from symphony._version import __version__
-from symphony.cli import (
-    agents,
-    data,
-    demo,
-    doctor,
-    evaluate,
-    export,
-    planners,
-    plot,
-    report,
-    simulate,
-    table,
-    test,
-    train,
-    view,
-    wosac,
-)
-from symphony.cli.shared import PARAGRAPHS, warn
+from symphony.cli.shared import Command, Result, warn
+from symphony.config.checks import Bounds
 from symphony.config.profiles import expanded
 from symphony.errors import (
     AllFailedError,
@@ -54,6 +38,9 @@ __all__ = ["main"]
 FAILED, USAGE, ALL_FAILED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 143
 
 GONE = {
+    "evaluate --wosac-config": "`symphony wosac evaluate` takes the year as --config",
+    "data info --routes": "`symphony plot routes` draws them",
+    "data info --per-segment": "the JSON always says which agents were chosen in each run segment",
     "plot tree": "`symphony simulate RUN --data DIR --out SIM` and `symphony view SIM` show the branches of a search",
     "plot rollouts": "`symphony evaluate RUN --data DIR --figure FILE` draws rollouts, and so does `symphony view`",
     "plot curvature --data": "evaluate the runs first: `symphony evaluate RUN --data DIR`",
@@ -67,24 +54,20 @@ DESCRIPTION = """Realistic and diverse traffic agents learned from logged drivin
 Every command explains itself, as in `symphony data convert --help`. The version: `symphony --version`. With
 SYMPHONY_DEBUG=1 in the environment, errors come with their traceback. Exit status: 0 done, 1 failed, 2 wrong usage,
 3 every simulated run failed."""
+COMMANDS = "data train evaluate table plot simulate view report export planners test wosac agents demo doctor"
+GROUPS = ("data", "plot", "wosac")
+"""Those that have commands of their own."""
 
-# Every command is a dataclass: its fields are the arguments, `run` does the work and raises what goes wrong.
 app = tyro.extras.SubcommandApp()
-app.command(data.app, name="data", help=data.__doc__)
-app.command(name="train")(train.Train)
-app.command(name="evaluate")(evaluate.Evaluate)
-app.command(name="table")(table.Table)
-app.command(plot.app, name="plot", help=plot.__doc__)
-app.command(name="simulate")(simulate.Simulate)
-app.command(name="view")(view.View)
-app.command(name="report")(report.Report)
-app.command(name="export")(export.Export)
-app.command(name="planners")(planners.Planners)
-app.command(name="test")(test.Test)
-app.command(wosac.app, name="wosac", help=wosac.__doc__)
-app.command(name="agents")(agents.Agents)
-app.command(name="demo")(demo.Demo)
-app.command(name="doctor")(doctor.Doctor)
+for _name in COMMANDS.split():
+    _module = importlib.import_module(f"symphony.cli.{_name}")
+    if _name in GROUPS:
+        _group = app.command(tyro.extras.SubcommandApp(), name=_name, help=_module.__doc__)
+        for _class in Command.__subclasses__():
+            if _class.__module__ == _module.__name__:
+                _group.command(name=_class.__name__.lower())(_class)
+    else:
+        app.command(name=_name)(getattr(_module, _name.capitalize()))
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -107,15 +90,15 @@ def main(args: Sequence[str] | None = None) -> int:
             *command, last = gone.split()
             if args[: len(command)] == command and last in args[len(command) :]:
                 raise ConfigError(f"`symphony {gone}` is gone: {instead}")
-        if args[:1] == ["train"]:
-            args = expanded(args)
         chosen = app.cli(
             prog="symphony",
             description=DESCRIPTION,
-            args=args,
+            args=expanded(args) if args[:1] == ["train"] else args,
             config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-            registry=PARAGRAPHS,
         )
+        for name, value, bounds in _marked(chosen, Bounds):
+            if (len(value) if isinstance(value, tuple) else value) < bounds.least:
+                raise ConfigError(f"{name}: give at least {bounds.least}")
     except ConfigError as error:
         return _complain(error, USAGE)
     except SystemExit as stop:
@@ -124,20 +107,20 @@ def main(args: Sequence[str] | None = None) -> int:
 
     def run() -> None:
         with contextlib.ExitStack() as held:
-            for path in results_of(chosen):
-                held.enter_context(lock_file(path))
-            chosen.run()
+            for _, path, _ in _marked(chosen, Result):
+                if path is not None and str(path) != "-":  # tried and locked before the work
+                    held.enter_context(lock_file(path))
+            chosen()
 
     return guarded(run)
 
 
-def results_of(command: Any) -> Iterator[Path]:
-    """Files that a command writes once everything is done: its results whose metavar is FILE."""
+def _marked(command: Any, mark: type) -> Iterator[tuple[str, Any, Any]]:
+    """Name, value and mark of the options whose types have a mark of a kind."""
     for name, hint in get_type_hints(type(command), include_extras=True).items():
-        path, extras = getattr(command, name), getattr(hint, "__metadata__", ())
-        named = any(getattr(extra, "metavar", None) == "FILE" for extra in extras)
-        if name in ("json", "figure", "out", "junit") and named and path is not None and str(path) != "-":
-            yield path
+        for extra in getattr(hint, "__metadata__", ()):
+            if isinstance(extra, mark):
+                yield name, getattr(command, name), extra
 
 
 def settle() -> None:
@@ -147,32 +130,12 @@ def settle() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
-class Terminated(KeyboardInterrupt):
-    """The process was asked to end (SIGTERM); whatever tidies up after an interrupt does so after this."""
-
-
-@contextlib.contextmanager
-def _ended_politely() -> Iterator[None]:
-    """Inside, SIGTERM ends the work as an interrupt does, where there are signals to be had."""
-
-    def end(number: int, frame: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough: tidying up must not be cut short
-        raise Terminated
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 def guarded(action: Callable[[], object]) -> int:
     """Run something; errors that a user can meet become one line and an exit status."""
+    ours = threading.current_thread() is threading.main_thread()  # others get no signals
+    before = signal.signal(signal.SIGTERM, _terminate) if ours else None
     try:
-        with _ended_politely(), warnings.catch_warnings():
+        with warnings.catch_warnings():
             warnings.showwarning = _warn
             action()
             sys.stdout.flush()
@@ -180,38 +143,37 @@ def guarded(action: Callable[[], object]) -> int:
         # The reader of our output has gone, say `head`; Python would complain once more as it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
-    except Terminated:
-        return _complain("terminated", TERMINATED)
-    except KeyboardInterrupt:
-        return _complain("interrupted", INTERRUPTED)
+    except KeyboardInterrupt as stop:
+        return _complain(str(stop) or "interrupted", TERMINATED if str(stop) else INTERRUPTED)
+    except CouldNotRunError as error:
+        return _complain(error, USAGE)
     except (SymphonyError, OSError) as error:
-        if isinstance(error, CouldNotRunError):
-            return _complain(error, USAGE)
         return _complain(error, ALL_FAILED if isinstance(error, AllFailedError) else FAILED)
+    finally:
+        if ours:
+            signal.signal(signal.SIGTERM, before)
     return 0
 
 
-def _warn(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
+def _terminate(number: int, frame: object) -> None:
+    """End the work as an interrupt does."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough: tidying up must not be cut short
+    raise KeyboardInterrupt("terminated")
+
+
+def _warn(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
     """Show our warnings in one line, those of libraries as they are."""
     if issubclass(category, DataWarning):
         warn(str(message))
     else:
-        (file or sys.stderr).write(warnings.formatwarning(message, category, filename, lineno, line))
+        sys.stderr.write(warnings.formatwarning(message, category, *place[:2]))
 
 
 def _complain(error: object, status: int) -> int:
     if isinstance(error, BaseException) and os.environ.get("SYMPHONY_DEBUG", "0") not in {"", "0"}:
         raise error
     if isinstance(error, OSError) and error.strerror:
-        where = f"{error.filename}: " if error.filename is not None else ""
-        error = f"{where}{error.strerror}"
+        error = f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
     text = printable(str(error), keep="\n")
     sys.stderr.write(f"symphony: error: {text}\n")
     return status

@@ -3,187 +3,150 @@
 from __future__ import annotations
 
 import math
-import sys
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
+from tyro.conf import Positional, arg
 
-from symphony.cli.shared import (
-    ResultFile,
-    at_least,
-    print_facts,
-    print_table,
-    progress,
-    say,
-    warn,
-    write_numbers,
-)
+import symphony
+from symphony.cli import shared
+from symphony.config.checks import Count, Natural
 from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
-    from symphony.data.generate import Generation, Plan
+    from symphony.data.generate import Plan
 
-WINDOWS = ("window", "stride", "motion")
-"""Options of the INTERACTION reader alone."""
-WITH_PRESET = {"out", "preset", "workers", "engine", "json"}
-Store = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
-
-app = tyro.extras.SubcommandApp()
+READER_OPTIONS = {"commonroad": ("egos",), "interaction": ("egos", "window", "stride", "motion")}
+"""Options of `data convert` that only some readers take."""
+LISTS = {"path", "files", "settings", "reasons", "odd_examples", "skipped", "skipped_details"}
+"""What `data info` tells in its JSON alone."""
 
 
-@app.command(name="generate")
-@dataclass(frozen=True)
-class Generate:
+class Generate(shared.Command):
     """Make run segments with SUMO: random networks and traffic.
 
     A run that was interrupted, in whatever way, is continued by the same command; a finished store is left as it
-    is. Equal arguments give equal stores (with the same version of SUMO), whatever the number of workers. At the
-    end the driving is measured.
+    is. Equal arguments give equal stores (with the same version of SUMO), whatever the number of workers.
     """
 
-    out: Path
-    """Folder of the store; with a preset, of its stores `train`, `validation` and `test`."""
-    count: int | None = None
-    """Number of run segments; needed unless a preset says it."""
+    out: Path  # Folder of the store; with a preset, of its stores `train`, `validation` and `test`.
+    count: int | None = None  # Number of run segments; needed unless a preset says it.
+    #: Standard set to make: 2 000 + 200 + 500 run segments, or 10 000 + 200 + 1 000, of 10 s.
     preset: Literal["town-small", "town"] | None = None
-    """A standard set: 2 000 + 200 + 500 run segments, or 10 000 + 200 + 1 000, of 10 s."""
-    seed: int = 0
-    """Seed of the networks: another one gives other networks."""
+    seed: int = 0  # Seed of the networks: another one gives other networks.
+    #: Use of the run segments: the three splits never share a network, except for roads of your own.
     split: Literal["train", "validation", "test"] = "train"
-    """Use of the run segments: the three splits never share a network, except for roads of your own."""
+    #: Kinds of network that take turns, with commas between: town, grid, ramp (freeways), or files with roads of
+    #: your own: OpenDRIVE (.xodr), OpenStreetMap (.osm) or SUMO (.net.xml).
     kinds: str = "town"
-    """Kinds of network that take turns, with commas between: town, grid, ramp (freeways), or files with roads of
-    your own: OpenDRIVE (.xodr), OpenStreetMap (.osm) or SUMO (.net.xml)."""
-    duration: Literal[10, 20, 30] = 10
-    """Seconds of a run segment."""
-    interactive: int = 2
-    """Vehicles that must be there and move at the first step."""
-    workers: int = 1
-    """Processes that make networks."""
-    engine: Literal["local", "ray"] = "local"
-    """Engine that runs these processes: `local`, on this machine, or `ray`, wherever Ray puts them."""
-    json: ResultFile = None
-    """File to write the measures to; - for standard output, the tables then go to standard error."""
+    duration: Literal[10, 20, 30] = 10  # Seconds of a run segment.
+    interactive: int = 2  # Vehicles that must be there and move at the first step.
+    workers: shared.Workers = 1
+    engine: shared.EngineName = "local"
+    json: shared.Json = None
 
     def __post_init__(self) -> None:
-        if self.preset is None and self.count is None:
-            raise ConfigError("give --count or --preset")
+        if (self.preset is None) == (self.count is None):
+            raise ConfigError("give --count or --preset, one of them")
         given = {f.name for f in fields(self) if getattr(self, f.name) != f.default}
-        if self.preset is not None and (extra := sorted(given - WITH_PRESET)):
-            raise ConfigError(f"--preset decides --{extra[0]} itself: give one or the other")
-        at_least(1, workers=self.workers)
+        if self.preset is not None and (own := given & {"seed", "split", "kinds", "duration", "interactive"}):
+            raise ConfigError(f"--preset decides --{min(own)} itself: give one or the other")
         self._plans()
 
-    def _plans(self) -> dict[str, tuple[Plan, Path]]:
-        """The stores to make, by split, and where."""
+    def _plans(self) -> list[tuple[str, Plan, Path]]:
+        """The stores to make: their split, plan and folder."""
         from symphony.data.generate import PRESETS, Plan
 
         if self.preset is not None:
-            return {split: (plan, self.out / split) for split, plan in PRESETS[self.preset].plans.items()}
+            return [(split, plan, self.out / split) for split, plan in PRESETS[self.preset].plans.items()]
         kinds = tuple(kind.strip() for kind in self.kinds.split(","))
-        more: Any = {"duration": self.duration, "interactive": self.interactive}
-        return {self.split: (Plan(self.count or 0, self.seed, self.split, kinds, **more), self.out)}
+        plan = Plan(self.count or 0, self.seed, self.split, kinds, self.duration, self.interactive)
+        return [(self.split, plan, self.out)]
 
-    def run(self) -> None:
-        """Make what is missing, measure, report."""
-        from symphony.data.generate import MADE_WITH, PRESETS, generate
+    def __call__(self) -> None:
+        from symphony.data.generate import MADE_WITH, PRESETS
         from symphony.data.sources.sumo import sumo_version
 
         expected: dict[Any, str] = {} if self.preset is None else dict(PRESETS[self.preset].checksums)
-        found = {}
-        for split, (plan, path) in self._plans().items():
-            with progress(f"generating {split}") as advance:
+        found = [self._make(*made, expected.get(made[0])) for made in self._plans()]
+        if shared.write_numbers(
+            self.json, {"preset": self.preset, "stores": {one["split"]: one for one in found}}
+        ):
+            for one in found:
+                shared.print_facts(one)
+        for one in found:
+            if one["expected_checksum"] not in (None, one["checksum"]):
+                text = "the checksum is not that of the standard set, which was made with"
+                shared.warn(f"{one['path']}: {text} {MADE_WITH}; yours was made with SUMO {sumo_version()}")
 
-                def show(done: int, state: Generation, total: int = plan.segments, to: Any = advance) -> None:
-                    to(done, total, f"from {state.networks} networks")
+    def _make(self, split: str, plan: Plan, path: Path, expected: str | None) -> dict[str, Any]:
+        from symphony.data.generate import generate
 
-                made = generate(plan, path, workers=self.workers, engine=self.engine, progress=show)
-            found[split] = entry = describe(path, plan, made)
-            print_facts(entry, str(path), aside=str(self.json) == "-")
-            if entry["checksum"] != expected.get(split, entry["checksum"]):
-                warn(
-                    f"{path}: the checksum differs from that of the standard set ({expected[split]}), which was "
-                    f"made with {MADE_WITH}; yours was made with SUMO {sumo_version()}: results on it are not "
-                    "comparable to the last digit"
-                )
-            entry["expected_checksum"] = expected.get(split)
-        write_numbers(self.json, {"preset": self.preset, "stores": found})
+        with shared.progress(f"generating {split}") as advance:
+
+            def show(done: int, state: Any) -> None:
+                advance(done, plan.segments, f"from {state.networks} networks")
+
+            made = generate(plan, path, workers=self.workers, engine=self.engine, progress=show)
+        store = symphony.SegmentStore(path)
+        about = {"split": split, "path": str(path), "segments": len(store), "checksum": store.checksum()}
+        return about | {
+            "expected_checksum": expected,
+            "settings": store.report["settings"],
+            "generation": asdict(made),
+        }
 
 
-@app.command(name="quality")
-@dataclass(frozen=True)
-class Quality:
+class Quality(shared.Command):
     """Measure the driving in a store: is it physical, varied, and within reach of the action space?"""
 
-    store: Store
-    """Folder of the store."""
-    interactive: int = 2
-    """Interactive agents per run segment: they are what is measured."""
-    json: ResultFile = None
-    """File to write the measures to; - for standard output, the table then goes to standard error."""
+    store: shared.Store
+    interactive: Count = 2  # Interactive agents per run segment: they are what is measured.
+    json: shared.Json = None
 
-    def __post_init__(self) -> None:
-        at_least(1, interactive=self.interactive)
+    def __call__(self) -> None:
+        from symphony.evaluation.logs import measure, shortfalls
 
-    def run(self) -> None:
-        """Measure and print."""
-        from symphony.evaluation.logs import shortfalls
-
-        quality = measured(self.store, self.interactive)
-        print_facts(quality, str(self.store), aside=str(self.json) == "-")
+        with shared.progress("measuring") as advance:
+            store = symphony.SegmentStore(self.store)
+            quality = measure(store, interactive=self.interactive, progress=advance)
+        if shared.write_numbers(self.json, quality):
+            shared.print_facts(quality, str(self.store))
         for missed in shortfalls(quality):
-            sys.stderr.write(f"below what generated sets must reach: {missed}\n")
-        write_numbers(self.json, quality)
+            shared.tell(f"below what generated sets must reach: {missed}")
 
 
-@app.command(name="hardest")
-@dataclass(frozen=True)
-class Hardest:
+class Hardest(shared.Command):
     """List the run segments of a store that are most critical for the ego, the hardest first.
 
     Four things make a segment critical, each with up to one point: a short time to collision, a short time between
     the ego and another who crosses its way, hard braking, and a small distance to the road's boundary.
     """
 
-    data: Store
-    """Folder of the store."""
-    count: int = 20
-    """Number of run segments that are listed."""
-    ids: bool = False
-    """Print only their ids, for the option --segments of other commands."""
-    json: ResultFile = None
-    """File to write the list to; - for standard output, in place of the table."""
+    store: shared.Store
+    count: Count = 20  # Number of run segments that are listed.
+    ids: bool = False  # Print only their ids, for the option --segments of other commands.
+    json: shared.Json = None
 
-    def __post_init__(self) -> None:
-        at_least(1, count=self.count)
-
-    def run(self) -> None:
-        """Look at every run segment and print the hardest."""
-        from rich.console import Console
-        from rich.table import Table
-
+    def __call__(self) -> None:
         from symphony.bench.criticality import hardest
-        from symphony.data.store import SegmentStore
 
-        with progress("looking at the log") as advance:
-            found = [one for _, one in hardest(SegmentStore(self.data), self.count, progress=advance)]
-        write_numbers(self.json, [{**asdict(one), "score": one.score} for one in found])
+        with shared.progress("looking at the log") as advance:
+            store = symphony.SegmentStore(self.store)
+            found = [one for _, one in hardest(store, self.count, progress=advance)]
+        told = shared.write_numbers(self.json, [{**asdict(one), "score": one.score} for one in found])
         if self.ids:
-            for one in found:
-                say(one.segment)
-        elif str(self.json) != "-":
-            table = Table("segment", "critical", "TTC s", "PET s", "braking m/s²", "to the edge m")
+            shared.say("\n".join(one.segment for one in found))
+        elif told:
+            rows = [["segment", "critical", "TTC s", "PET s", "braking m/s²", "to the edge m"]]
             for one in found:
                 numbers = (one.score, one.time_to_collision, one.encroachment, one.braking, one.margin)
-                table.add_row(one.segment, *("–" if math.isinf(n) else f"{n:.2f}" for n in numbers))
-            print_table(table, Console())
+                rows.append([one.segment, *("–" if math.isinf(n) else f"{n:.2f}" for n in numbers)])
+            shared.print_table(rows, heads=1)
 
 
-@app.command(name="convert")
-@dataclass(frozen=True)
-class Convert:
+class Convert(shared.Command):
     """Convert logs into a store of run segments.
 
     A record that can't be used is skipped, counted and reported. The store appears once everything is converted;
@@ -191,251 +154,123 @@ class Convert:
     the same command is given again.
     """
 
-    format: tyro.conf.Positional[Literal["womd", "commonroad", "argoverse2", "interaction", "scenarionet"]]
-    """Format of the logs: Waymo Open Motion Dataset (TFRecord), CommonRoad (XML), Argoverse 2 motion forecasting
-    (Parquet, each with its map beside it), INTERACTION (CSV with Lanelet2 maps), ScenarioNet (pickle)."""
-    files: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]],
-        tyro.conf.arg(metavar="FILE ...", help_behavior_hint="(required)"),
-    ]
-    """Files of that format, or folders to search for them."""
-    out: Path
-    """Folder of the store."""
-    rate: float = 5.0
-    """Steps per second in the store (the paper's 5)."""
-    interactive: int = 2
-    """Interactive agents a run segment must have at its first step."""
-    smooth: float = 0.0
-    """Smoothing of the tracks before they are resampled: sigma in seconds, 0 for none."""
+    #: Format of the logs: Waymo Open Motion Dataset (TFRecord), CommonRoad (XML), Argoverse 2 motion
+    #: forecasting (Parquet, each with its map beside it), INTERACTION (CSV with Lanelet2 maps), ScenarioNet (pickle).
+    format: Positional[Literal["womd", "commonroad", "argoverse2", "interaction", "scenarionet"]]
+    #: Files of that format, or folders to search for them.
+    files: Annotated[Positional[shared.Paths], arg(metavar="FILE ...")]
+    out: Path  # Folder of the store.
+    rate: float = 5.0  # Steps per second in the store (the paper's 5).
+    interactive: int = 2  # Interactive agents a run segment must have at its first step.
+    smooth: float = 0.0  # Smoothing of the tracks before they are resampled: sigma in seconds, 0 for none.
+    #: Egos of each scenario of CommonRoad or window of INTERACTION, which name none: `one`, that with the most moving
+    #: vehicles around it, or `all` moving vehicles seen throughout, with a run segment each.
     egos: Literal["one", "all"] = "one"
-    """CommonRoad and INTERACTION, which name no ego vehicle: make one run segment of each scenario or window, with
-    the ego that has the most moving vehicles around it, or one for every moving vehicle seen throughout."""
-    window: float = 10.0
-    """INTERACTION: seconds of the run segments that recordings are cut into."""
+    window: float = 10.0  # Seconds of the run segments that recordings of INTERACTION are cut into.
+    #: Seconds between the starts of two windows of INTERACTION; without it, one begins where another ends.
     stride: float | None = None
-    """INTERACTION: seconds between the starts of two windows; without it, one begins where another ends."""
+    #: Source of velocities and headings of INTERACTION: as logged, or the positions (for files that are refused
+    #: because theirs don't fit).
     motion: Literal["logged", "positions"] = "logged"
-    """INTERACTION: take velocities and headings as logged, or from the positions (for files that are refused because
-    theirs don't fit)."""
+    #: Metres from the ego's path within which map and agents are kept: for sources that give whole districts, whose
+    #: maps would exceed the paper's limit (ScenarioNet).
     radius: float | None = None
-    """Keep what comes within so many metres of the ego's path, of map and agents: for sources that give whole
-    districts, whose maps would exceed the paper's limit (ScenarioNet)."""
+    #: Leave out run segments in whose log a moving vehicle's box overlaps another box.
     exclude_overlaps: bool = False
-    """Leave out run segments in whose log a moving vehicle's box overlaps another box."""
+    #: Give lights the last state that the log knows (before the first: the first) where it knows none, instead
+    #: of `unknown`: for logs that show their lights at a single step (see docs/formats.md).
     hold_lights: bool = False
-    """Give lights the last state that the log knows (before the first: the first) where it knows none, instead of
-    `unknown`: for logs that show their lights at a single step (see docs/formats.md)."""
+    #: Skip a record of which something odd would be left out (an agent without a size, a state that no car can have,
+    #: a node that the map lacks), instead of reading the rest of it.
     strict: bool = False
-    """Skip a record of which something odd would be left out (an agent without a size, a state that no car can have,
-    a node that the map lacks), instead of reading the rest of it."""
-    workers: int = 1
-    """Processes that convert files; the store does not depend on their number."""
-    engine: Literal["local", "ray"] = "local"
-    """Engine that runs these processes: `local`, on this machine, or `ray`, on the Ray cluster at RAY_ADDRESS (else a
-    Ray on this machine), whose machines must share the files and the folder of the store."""
+    workers: shared.Workers = 1
+    engine: shared.EngineName = "local"
 
     def __post_init__(self) -> None:
-        if not self.files:
-            raise ConfigError("no files given")
-        if not 0.2 <= self.rate <= 200:
-            raise ConfigError(f"--rate must be between 0.2 and 200 steps per second, is {self.rate:g}")
-        at_least(1, interactive=self.interactive, workers=self.workers)
-        if not self.smooth >= 0:
-            raise ConfigError(f"--smooth must not be negative, is {self.smooth}")
-        if self.radius is not None and not self.radius > 0:
-            raise ConfigError(f"--radius must be positive, is {self.radius}")
-        if self.egos == "all" and self.format not in {"commonroad", "interaction"}:
-            raise ConfigError(
-                f"--egos all is for commonroad and interaction; {self.format} names its ego vehicle"
+        for f in fields(self):
+            wrong = f.name in READER_OPTIONS["interaction"] and f.name not in READER_OPTIONS.get(
+                self.format, ""
             )
-        given = [f.name for f in fields(self) if f.name in WINDOWS and getattr(self, f.name) != f.default]
-        if given and self.format != "interaction":
-            raise ConfigError(f"--{given[0]} is for interaction")
+            if wrong and getattr(self, f.name) != f.default:
+                raise ConfigError(f"--{f.name} is not for {self.format}")
 
-    def run(self) -> None:
-        """Convert, showing how far it is, and report."""
+    def __call__(self) -> None:
         from symphony.data.convert import convert
 
         settings = {f.name: getattr(self, f.name) for f in fields(self)}
         reader, files, out = (settings.pop(name) for name in ("format", "files", "out"))
-        options = {name: settings.pop(name) for name in ("egos", *WINDOWS)}
-        names = {"commonroad": ("egos",), "interaction": ("egos", *WINDOWS)}.get(self.format, ())
-        settings["reader_options"] = {name: options[name] for name in names} or None
-        with progress("converting", "files") as advance:
-            try:
-                report = convert(
-                    reader,
-                    files,
-                    out,
-                    progress=lambda done, total, so_far: advance(
-                        done, total, f"{so_far.converted} converted, {len(so_far.skipped)} skipped"
-                    ),
-                    **settings,
-                )
-            except KeyboardInterrupt:
-                sys.stderr.write("What is done is kept: the same command goes on with it.\n")
-                raise
-        firsts = {
-            f"{reason} (first: {report.odd_examples[reason]})"
-            if reason in report.odd_examples
-            else reason: count
-            for reason, count in report.odd.items()
-        }
+        options = {name: settings.pop(name) for name in READER_OPTIONS["interaction"]}
+        settings["reader_options"] = {name: options[name] for name in READER_OPTIONS.get(reader, ())}
+        with shared.progress("converting", "files") as advance:
+
+            def show(done: int, total: int, so_far: Any) -> None:
+                advance(done, total, f"{so_far.converted} converted, {len(so_far.skipped)} skipped")
+
+            report = convert(reader, files, out, progress=show, **settings)
         rows = {
             "converted": report.converted,
-            "excluded": _excluded(report.exclusions),
+            "excluded": {name: count for name, count in report.exclusions.items() if count},
             "skipped": report.problems,
-            "odd": firsts,
-            "converted with boxes that overlap in the log": report.overlaps,
-            "gaps between lanes joined": report.joined_gaps,
+            "odd": report.odd,
+            "first odd": report.odd_examples,
+            "overlaps": report.overlaps,
+            "joined gaps": report.joined_gaps,
         }
-        print_facts({name: count for name, count in rows.items() if count}, str(self.out))
+        shared.print_facts({name: count for name, count in rows.items() if count}, str(out))
         if report.warning:
-            warn(report.warning)
+            shared.warn(report.warning)
 
 
-@app.command(name="merge")
-@dataclass(frozen=True)
-class Merge:
+class Merge(shared.Command):
     """Copy the run segments of several stores into a new one, to learn from all of them."""
 
-    stores: Annotated[
-        tyro.conf.Positional[tuple[Path, ...]],
-        tyro.conf.arg(metavar="DIR ...", help_behavior_hint="(required)"),
-    ]
-    """Folders of the stores; they must have the same time step and no run segment in common."""
-    out: Path
-    """Folder of the new store."""
+    #: Folders of the stores; they must have the same time step and no run segment in common.
+    stores: Annotated[Positional[shared.Paths], arg(metavar="DIR ...")]
+    out: Path  # Folder of the new store.
 
-    def __post_init__(self) -> None:
-        if not self.stores:
-            raise ConfigError("no stores given")
+    def __call__(self) -> None:
+        from symphony.data.convert import merge
 
-    def run(self) -> None:
-        """Copy, showing how far it is, and print what there is."""
-        from symphony.data.convert import info, merge
-
-        with progress("copying") as advance:
+        with shared.progress("copying") as advance:
             merge(self.stores, self.out, advance)
-        _print_info(info(self.out))
+        Info(store=self.out, interactive=0)()
 
 
-@app.command(name="info")
-@dataclass(frozen=True)
-class Info:
-    """Say what a store of run segments holds."""
+class Info(shared.Command):
+    """Say what a store of run segments holds; the JSON also lists skipped records and who is interactive where."""
 
-    store: Store
-    """Folder of the store."""
-    json: ResultFile = None
-    """File to write everything to, the skipped records included; - for standard output, and nothing else."""
-    interactive: int = 2
-    """Interactive agents that are chosen in each run segment, to count why the ego's partner was chosen; 0 leaves
-    this out."""
-    per_segment: bool = False
-    """In the JSON, say for each run segment which agents were chosen, and why."""
+    store: shared.Store
+    json: shared.Json = None
+    #: Interactive agents to choose in each run segment, to count why the ego's partner was chosen; 0: none.
+    interactive: Natural = 2
 
-    def __post_init__(self) -> None:
-        at_least(0, interactive=self.interactive)
-        if self.per_segment and not (self.json and self.interactive):
-            raise ConfigError("--per-segment goes with --json and interactive agents")
-
-    def run(self) -> None:
-        """Print it."""
+    def __call__(self) -> None:
         from symphony.data.convert import info
         from symphony.data.selection import choices
-        from symphony.data.store import SegmentStore
 
-        found = info(self.store)
+        found, store = info(self.store), symphony.SegmentStore(self.store)
         if self.interactive:
-            found["interactive"] = choices(SegmentStore(self.store), self.interactive)
-            if not self.per_segment:
-                del found["interactive"]["segments"]
-        write_numbers(self.json, found)
-        if str(self.json) != "-":
-            _print_info(found)
+            found["interactive"] = choices(store, self.interactive)
+        if shared.write_numbers(self.json, found):
+            found.get("interactive", {}).pop("segments", None)
+            shared.print_facts(
+                {name: value for name, value in found.items() if name not in LISTS}, found["path"]
+            )
 
 
-@app.command(name="verify")
-@dataclass(frozen=True)
-class Verify:
+class Verify(shared.Command):
     """Read a whole store and compare every segment with the hash that was written with it, and with the schema.
 
     Training and evaluation do so for each segment when they first read it.
     """
 
-    store: Store
-    """Folder of the store."""
-    json: ResultFile = None
-    """File to write the result to; - for standard output, and nothing else."""
+    store: shared.Store
+    json: shared.Json = None
 
-    def run(self) -> None:
-        """Verify, showing how far it is, and print."""
-        from symphony.data.store import SegmentStore
-
-        store = SegmentStore(self.store)
-        with progress("verifying") as advance:
+    def __call__(self) -> None:
+        store = symphony.SegmentStore(self.store)
+        with shared.progress("verifying") as advance:
             store.verify(advance)
         found = {"path": str(store.path), "segments": len(store), "checksum": store.checksum()}
-        write_numbers(self.json, found)
-        if str(self.json) != "-":
-            say(f"{len(store)} segments are what was written; checksum {found['checksum']}")
-
-
-def _excluded(found: dict[str, int]) -> dict[str, int]:
-    """The paper's exclusions that left something out, in words."""
-    from symphony.data.selection import EXCLUSIONS
-
-    return {EXCLUSIONS[name]: count for name, count in found.items() if count}
-
-
-def _print_info(found: dict[str, Any]) -> None:
-    excluded, chosen = found["exclusions"], found.get("interactive")
-    shown = {name: found[name] for name in ("segments", "sources")} | {"recordings": found["groups"]}
-    shown |= {
-        name: found[name]
-        for name in ("agents", "signals", "steps", "duration", "dt", "maps", "lanes", "map_points")
-    }
-    if chosen:
-        partners = {f"partner: {context}": count for context, count in chosen["contexts"].items()}
-        shown["interactive agents"] = {
-            "each": chosen["count"],
-            **partners,
-            "too few vehicles": chosen["too_few"],
-        }
-    shown |= {"MiB on disk": found["bytes"] / 2**20, "checksum": found["checksum"]}
-    shown |= {"excluded": sum(excluded.values()), **_excluded(excluded)}
-    shown |= {"skipped": sum(found["problems"].values()), **found["problems"]}
-    more = {"odd": found["odd"], "boxes overlap in the log of": found["overlaps"]}
-    more |= {"gaps between lanes joined": found["joined_gaps"]}
-    more |= {"unfinished": found["unfinished_generation"]}
-    print_facts(shown | {name: value for name, value in more.items() if value}, found["path"])
-
-
-def measured(path: Path, interactive: int) -> dict[str, Any]:
-    """The measures of a store, with a progress bar."""
-    from symphony.data.store import SegmentStore
-    from symphony.evaluation.logs import measure
-
-    with progress("measuring") as advance:
-        return measure(SegmentStore(path), interactive=interactive, progress=advance)
-
-
-def describe(path: Path, plan: Plan, made: Generation) -> dict[str, Any]:
-    """What a generated store holds and how it was made; its measures are taken once and kept in its report."""
-    from symphony.data.generate import add_to_report
-    from symphony.data.store import SegmentStore
-
-    store = SegmentStore(path)
-    quality = store.report.get("quality")
-    if quality is None:
-        quality = measured(path, plan.interactive)
-        add_to_report(path, "quality", quality)
-    return {
-        "path": str(path),
-        "settings": store.report["settings"],
-        "segments": len(store),
-        "checksum": store.checksum(),
-        "generation": asdict(made),
-        "quality": quality,
-    }
+        if shared.write_numbers(self.json, found):
+            shared.say(f"{len(store)} segments are what was written; checksum {found['checksum']}")

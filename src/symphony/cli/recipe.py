@@ -4,32 +4,27 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import tyro
 
+import symphony
 from symphony.cli import guarded, settle
-from symphony.cli.shared import PARAGRAPHS, print_evaluation, progress
-from symphony.config import EvaluateConfig, Profile, TrainConfig
-from symphony.config.profiles import WORDS, expanded
+from symphony.cli.evaluate import Evaluate
+from symphony.cli.train import Train
+from symphony.config import EvaluateConfig
+from symphony.config.profiles import expanded
 
 if TYPE_CHECKING:
     from symphony.recipes import Recipe
 
 
-@dataclass(frozen=True)
-class Arguments:
+class Arguments(Train):
     """Train on one store, evaluate on another beside log playback and constant velocity."""
 
-    training: Annotated[TrainConfig, tyro.conf.arg(name="")]
-    """The training run."""
-    test: Path
-    """Store of run segments to evaluate the agent on."""
-    rollouts: int = 16
-    """Rollouts per run segment in the evaluation."""
-    profile: Annotated[Profile, tyro.conf.arg(help=WORDS)] = "default"
+    test: Path  # Store of run segments to evaluate the agent on.
+    rollouts: int = 16  # Rollouts per run segment in the evaluation.
 
 
 def main(recipe: Recipe, description: str | None, args: Sequence[str] | None = None) -> None:
@@ -37,20 +32,11 @@ def main(recipe: Recipe, description: str | None, args: Sequence[str] | None = N
     if args is None:
         settle()
         sys.exit(guarded(lambda: main(recipe, description, sys.argv[1:])))
-    from symphony.agents import load_agent
-    from symphony.data.store import SegmentStore
-    from symphony.evaluation import evaluate
-    from symphony.evaluation.records import evaluation_record, keep_evaluation
     from symphony.recipes import train
 
-    words = expanded([recipe.__name__, *args])
-    settings = tyro.cli(Arguments, description=description, args=words, registry=PARAGRAPHS)
-    store = SegmentStore(settings.test)  # or complain now, not after the training
-    training = settings.training
-    folder = train(training, recipe)
+    settings = tyro.cli(Arguments, description=description, args=expanded([recipe.__name__, *args]))
+    symphony.SegmentStore(settings.test)  # complains now, not after the training
+    folder, training = train(settings.config, recipe), settings.config
     config = EvaluateConfig(rollouts=settings.rollouts, seed=training.seed, device=training.device)
-    agent = load_agent(str(folder), config.device, trust_code=True)  # the user's own words a moment ago
-    with progress(f"evaluating {agent.name}") as advance:
-        found = evaluate(agent, store, config, advance, baselines=True)
-    print_evaluation(found, settings.test)
-    keep_evaluation(agent.name, evaluation_record(agent, found, store))
+    # What its folder names is the user's own words of a moment ago.
+    Evaluate(agent=str(folder), data=settings.test, trust_code=True, config=config)()

@@ -1,97 +1,127 @@
-"""What commands share: help texts, run segments by name, progress, results on the terminal and as JSON."""
+"""What commands share: options, run segments by name, progress, results on the terminal and as JSON."""
 
 from __future__ import annotations
 
 import math
-import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, dataclass_transform
 
-import tyro
-from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
+from tyro.conf import Positional, arg
 
-from symphony.errors import ConfigError, printable
+import symphony
+from symphony.config import EvaluateConfig
+from symphony.config.checks import Bounds, Count
+from symphony.config.evaluation import Engine, check_planner_seconds
+from symphony.errors import AllFailedError, ConfigError, printable
 from symphony.files import json_text, write_json
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
     from symphony.data.store import SegmentStore
     from symphony.evaluation import Evaluation
-
-TrustCode = Annotated[
-    bool,
-    tyro.conf.arg(
-        help="Run the code that the agent's folder names by import paths; without it such a folder is refused."
-    ),
-]
-ResultFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
-"""A file that a command writes once everything is done (see `results_of` of the command line)."""
-Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")]
-
-PARAGRAPHS = ConstructorRegistry()
-"""For `tyro.cli`, which by itself keeps the line breaks of an attribute's docstring where its lines are indented."""
-_under_way: list[object] = []
+    from symphony.saved.folder import RolloutFolder
 
 
-@PARAGRAPHS.struct_rule
-def _joined(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """What tyro makes of a dataclass, with the lines of every paragraph of its help texts joined."""
-    if any(info is one for one in _under_way):
-        return None
-    _under_way.append(info)
-    try:
-        found = ConstructorRegistry.get_struct_spec(info)
-    finally:
-        _under_way.pop()
-    if not isinstance(found, StructConstructorSpec):
-        return None
-    fields = [replace(field, helptext=_paragraphs(field.helptext)) for field in found.fields]
-    return replace(found, fields=tuple(fields))
+class Result(str):
+    """Marks the option of a file that a command writes once everything is done."""
 
 
-def _paragraphs(told: str | Callable[[], str | None] | None) -> Callable[[], str | None]:
-    """What gives the text: docstrings are read only when help is asked for."""
-
-    def text() -> str | None:
-        found = told() if callable(told) else told
-        return found and re.sub(r"(?<!\n)\n(?!\s*\n) *", " ", found)
-
-    return text
-
-
-def at_least(least: int, **options: int) -> None:
-    """Raise ConfigError for an option that is less."""
-    for name, value in options.items():
-        if value < least:
-            bound = f"be at least {least}" if least else "not be negative"
-            raise ConfigError(f"--{name.replace('_', '-')} must {bound}, is {value}")
+Paths = Annotated[tuple[Path, ...], Bounds(1)]
+ResultFile = Annotated[Path | None, Result(), arg(metavar="FILE")]
+_JSON = "File to write all numbers to as JSON; - for standard output, and nothing else there."
+Json = Annotated[Path | None, Result(), arg(metavar="FILE", help=_JSON)]
+Picture = Annotated[Path, Result(), arg(metavar="FILE", help="Picture to write (.png, .pdf or .svg).")]
+Store = Annotated[Positional[Path], arg(metavar="DIR", help="Folder of the store.")]
+Saved = Annotated[Positional[Path], arg(metavar="SIM", help="Folder of rollouts (`symphony simulate`).")]
+_SEGMENTS = "Ids of run segments, or their numbers in the store, to use no others."
+Segments = Annotated[tuple[str, ...], arg(metavar="ID ...", help=_SEGMENTS)]
+_TRUST = "Run the code that the agent's folder names by import paths; without it such a folder is refused."
+TrustCode = Annotated[bool, arg(help=_TRUST)]
+Workers = Annotated[Count, arg(help="Number of processes; it changes the speed, not the results.")]
+_ENGINE = "Engine that runs the processes: `local`, on this machine, or `ray`, on a Ray cluster."
+EngineName = Annotated[Engine, arg(help=_ENGINE)]
 
 
-def segment_index(store: SegmentStore, name: str) -> int:
-    """The place in a store of a run segment that is named by its id or its number.
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
+class Command:
+    """A command: its subclasses are frozen dataclasses of arguments, and a call does the work.
 
-    Raises:
-        DataError: there is no such segment.
+    Comments at the fields, or above them after `#:`, are their help.
     """
-    return store.index_of(int(name) if name not in store.ids and name.isdecimal() else name)
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
+
+
+class Simulation(Command):
+    """An agent on run segments, alone or beside a planner."""
+
+    #: Folder of a run (see `symphony train`), `pretrained:NAME` (an agent that comes with the
+    #: package), `playback` (the log itself), `constant_velocity` or `idm` (the intelligent driver model, along the
+    #: route of the log).
+    agent: Annotated[Positional[str], arg(metavar="RUN")]
+    data: Path  # Store of run segments to simulate.
+    segments: Segments = ()
+    #: Planner that drives the ego, while the agent drives the other interactive agents: `idm`, `log`, or one of your
+    #: own: a file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback`
+    #: as the agent all others play back the log. Nothing is searched then, unless --search, --branches or --trees say
+    #: so: a search asks the planner once for each branch.
+    planner: str = ""
+    planner_seconds: float = 60.0  # Seconds that a planner has for one answer; a longer one fails the run.
+    trust_code: TrustCode = False
+    config: Annotated[EvaluateConfig, arg(name="")] = field(default_factory=EvaluateConfig)
+
+    def __post_init__(self) -> None:
+        check_planner_seconds(self.planner_seconds)
+
+    def simulated(
+        self, out: Path, runs: int = 0, goals: tuple[str, ...] = (), tree: bool = True
+    ) -> RolloutFolder:
+        """Simulate and save in a folder; the other arguments are those of the command."""
+        from symphony.learning.demonstrations import evenly_spaced
+        from symphony.rollouts.crowd import crowd_dataset
+        from symphony.rollouts.driving import beside_planner, spread_runs
+        from symphony.saved.saving import save_simulation
+
+        agent = symphony.load_agent(self.agent, self.config.device, trust_code=self.trust_code)
+        store, planner = symphony.SegmentStore(self.data), self.planner
+        config = beside_planner(self.config) if planner else self.config
+        chosen = segment_indices(store, self.segments)
+        if runs:
+            count, config = spread_runs(agent, config, runs, len(store))
+            chosen = evenly_spaced(len(store), count)
+        # Beside log playback nobody else is simulated.
+        crowd = {"default": 1 if planner and agent.policy is None else agent.interactive}
+        dataset = crowd_dataset(store, agent, config, chosen or None, routes=bool(planner or goals), **crowd)
+        beside: dict[str, Any] = {"planner": planner, "planner_seconds": self.planner_seconds, "goals": goals}
+        with progress(f"simulating {agent.name}") as advance:
+            return save_simulation(out, agent, dataset, config, keep_tree=tree, progress=advance, **beside)
+
+
+def tell_failed(folder: RolloutFolder) -> None:
+    """Tell how many runs failed, and why the first of them did; AllFailedError if all did."""
+    why = [f"{saved.segment.segment_id}, {reason}" for saved in folder for reason in saved.failed.values()]
+    why += [f"{entry.segment}, {entry.failed}" for entry in folder.failures for _ in range(entry.rollouts)]
+    runs = sum(entry.rollouts for entry in [*folder.entries, *folder.failures])
+    if why and len(why) == runs:
+        raise AllFailedError(f"all {runs} runs failed, the first: {why[0]}")
+    if why:
+        tell(f"{len(why)} of {runs} runs failed, the first: {why[0]}")
 
 
 def segment_indices(store: SegmentStore, names: Sequence[str]) -> list[int]:
-    """The places in a store of some run segments, each named once.
+    """The places in a store of some run segments, each named once, by its id or its number.
 
     Raises:
-        ConfigError: one is named twice, by its id or its number.
+        ConfigError: one is named twice.
         DataError: there is no such segment.
     """
     found: dict[int, str] = {}
     for name in names:
-        place = segment_index(store, name)
+        place = store.index_of(int(name) if name not in store.ids and name.isdecimal() else name)
         if place in found:
             raise ConfigError(f"segment {store.ids[place]} is named twice: {found[place]}, {name}")
         found[place] = name
@@ -106,31 +136,90 @@ def progress(description: str, unit: str = "segments") -> Iterator[Callable[...,
     """
     from rich.console import Console
     from rich.markup import escape
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress, TextColumn
 
-    columns = (TextColumn(escape(description)), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
-    note, left = TextColumn("{task.fields[note]}"), TimeRemainingColumn()
-    with Progress(*columns, note, left, console=Console(stderr=True)) as bar:
-        task = bar.add_task("", total=None, note="")
-        yield lambda done, total, note="": bar.update(task, completed=done, total=total, note=note)
+    columns = (*Progress.get_default_columns(), TextColumn("{task.fields[note]}"))
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(escape(description), total=None, note="")
+
+        def advance(done: int, total: int | None, note: str = "") -> None:
+            bar.update(task, completed=done, total=total, note=f"{done} of {total} {unit} {note}")
+
+        yield advance
 
 
 def say(text: str) -> None:
-    """Print lines as they are, neither wrapped nor coloured."""
+    """Print lines on standard output, with what a terminal would act on escaped."""
     print(printable(text, keep="\n"))  # noqa: T201
+
+
+def tell(text: str) -> None:
+    """Print a line beside the results, on standard error."""
+    sys.stderr.write(f"{printable(text)}\n")
 
 
 def warn(text: str) -> None:
     """Print a warning on standard error."""
-    sys.stderr.write(f"symphony: warning: {printable(text)}\n")
+    tell(f"symphony: warning: {text}")
 
 
-def write_numbers(path: Path | None, numbers: Any) -> None:
-    """Write numbers as JSON to a file, or to standard output where the file is called -; without a file nowhere."""
+def write_numbers(path: Path | None, numbers: Any) -> bool:
+    """Write numbers as JSON to a file, to standard output where the file is called -, or nowhere.
+
+    Returns:
+        Whether a text is to be printed, too.
+    """
     if str(path) == "-":
         sys.stdout.write(json_text(numbers))
     elif path is not None:
         write_json(path, numbers)
+    return str(path) != "-"
+
+
+def write_text(path: Path | None, text: str) -> None:
+    """Write a text to a file, or to standard output where none is given."""
+    from symphony.files import write_file
+
+    if path is None:
+        sys.stdout.write(text)
+    else:
+        write_file(path, text)
+
+
+def print_table(rows: Sequence[Sequence[str]], title: str = "", *, heads: int = 0) -> None:
+    """Print rows of cells in columns, the first one flush left, with a rule below those that are headings."""
+    shown = [[printable(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*shown, strict=True)]
+    forms = [f"{{:{'>' if k else '<'}{width}}}" for k, width in enumerate(widths)]
+    lines = ["  ".join(map(str.format, forms, row)) for row in shown]
+    rule = ["-" * max(map(len, lines))] if heads else []
+    say("\n".join([title] * bool(title) + lines[:heads] + rule + lines[heads:]))
+
+
+def print_facts(found: Mapping[str, Any], title: str = "") -> None:
+    """Print a record as rows of a name and a value."""
+    rows = list(_rows(found))
+    width = max((len(name) for name, _ in rows), default=0)
+    say("\n".join([title] * bool(title) + [f"{name:<{width}}  {value}".rstrip() for name, value in rows]))
+
+
+def _rows(found: Mapping[str, Any], indent: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in found.items():
+        name = indent + printable(str(key).replace("_", " "))
+        if isinstance(value, Mapping) and {"mean", "max"} <= value.keys():
+            yield name, ", ".join(f"{part} {_number(number)}" for part, number in value.items())
+        elif isinstance(value, Mapping) and value:
+            yield name, ""
+            yield from _rows(value, f"{indent}  ")
+        else:
+            values = value if isinstance(value, list | tuple) else [value]
+            yield name, "none" if value in ({}, [], ()) else ", ".join(map(_number, values))
+
+
+def _number(value: Any) -> str:
+    if isinstance(value, float):
+        return "–" if math.isnan(value) else f"{value:.4g}"
+    return "–" if value is None else printable(str(value))
 
 
 COLUMNS = (
@@ -140,120 +229,52 @@ COLUMNS = (
     ("min_sade", "minSADE\nm", 2),
     ("curvature_jsd", "JSD\nnats", 3),
 )
+"""Numbers in the table of agents, with the two lines of their headings, and digits."""
 
 
-def print_table(table: Table, console: Console) -> None:
-    """Print a table as wide as what is in it: a name is neither cut nor broken, however narrow the terminal."""
-    from rich.measure import Measurement
+def metrics_rows(rows: Sequence[Mapping[str, Any]], first: str = "agent") -> list[list[str]]:
+    """The table of some agents' records, with two rows of headings.
 
-    if table.title:
-        # Beside the table, or it would be broken to its width.
-        console.print(table.title, style=table.title_style or "italic", soft_wrap=True)
-        table.title = None
-    if not table.row_count:
-        return  # nothing has no width
-    options = console.options.update(max_width=sys.maxsize)
-    before, needed = console.width, Measurement.get(console, options, table).maximum
-    console.width = max(before, needed)
-    try:
-        console.print(table, crop=False)
-    finally:
-        console.width = before
+    Args:
+        rows: numbers of each agent, and its name as ``agent``.
+        first: heading of the first column.
+    """
+    table = [[heading.split("\n")[k] for heading in (f"{first}\n", *(c[1] for c in COLUMNS))] for k in (0, 1)]
+    for row in rows:
+        numbers = ((row[n], row.get(f"{n}_se"), digits, row.get(f"{n}_bound")) for n, _, digits in COLUMNS)
+        table.append([row["agent"], *(number_cell(*number) for number in numbers)])
+    return table
 
 
-def print_facts(found: Mapping[str, Any], title: str = "", *, aside: bool = False) -> None:
-    """Print a record as rows of a name and a value, to standard error if ``aside``."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(show_header=False, box=None, pad_edge=False, title=escape(printable(title)) or None)
-    for name, value in _rows(found):
-        table.add_row(escape(printable(name)), escape(printable(value)))
-    print_table(table, Console(stderr=aside, highlight=False))
-
-
-def _rows(found: Mapping[str, Any], indent: str = "") -> Iterator[tuple[str, str]]:
-    for key, value in found.items():
-        name = indent + str(key).replace("_", " ")
-        if isinstance(value, Mapping) and {"mean", "max"} <= value.keys():
-            yield name, ", ".join(f"{part} {_number(number)}" for part, number in value.items())
-        elif isinstance(value, Mapping) and value:
-            yield name, ""
-            yield from _rows(value, f"{indent}  ")
-        elif isinstance(value, list | tuple):
-            yield name, ", ".join(map(_number, value)) or "none"
-        else:
-            yield name, "none" if value == {} else _number(value)
-
-
-def _number(value: Any) -> str:
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return "–"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def print_metrics(
-    rows: Sequence[dict[str, Any]], title: str = "", *, aside: bool = False, details: bool = False
-) -> None:
+def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, details: bool = False) -> None:
     """Print results of agents as one table and a line of what they are of.
 
     Args:
         rows: a record for each agent.
         title: of the table.
-        aside: print to standard error.
         details: also print every number of each agent.
     """
-    from rich.console import Console
-
-    console = Console(stderr=aside, highlight=False)
-    # Narrow enough for 80 columns, so the divergence goes without its error.
-    shown = [{**row, "curvature_jsd_se": None, "agent": short_name(str(row["agent"]))} for row in rows]
-    print_table(metrics_table(shown, title), console)
-    for row in shown:
+    named = [{**row, "agent": short_name(str(row["agent"]))} for row in rows]
+    print_table(metrics_rows(named), title, heads=2)
+    for row in named:
         for name in (name for name in row if ":" in name and not name.endswith("_se")):  # the user's own
-            line = f"{row['agent']}: {name} {number_cell(row[name], row.get(f'{name}_se'), 4)}"
-            console.print(line, style="dim", markup=False)
-    if details:
-        for row in rows:
-            print_facts(
-                {name: value for name, value in row.items() if name != "agent"}, row["agent"], aside=aside
-            )
+            say(f"{row['agent']}: {name} {number_cell(row[name], row.get(f'{name}_se'), 4)}")
+        if details:
+            print_facts({name: value for name, value in row.items() if name != "agent"}, row["agent"])
     first, most = rows[0], max(row["rollouts"] for row in rows)
     driven = "all vehicles" if first["interactive"] == "all" else f"{first['interactive']} interactive agents"
     if first["interactive"] not in ("all", 1, 2):  # a segment with fewer has those that there are
         driven = f"up to {driven}"
-    console.print(
+    say(
         f"{first['segments']} run segments of {first['groups']} recordings, {driven} each, up to {most} rollouts; "
-        f"± standard error over recordings, ≤ exact bound of a zero (95 %); seed {first['seed']}",
-        style="dim",
-        soft_wrap=True,
+        f"± standard error over recordings, ≤ exact bound of a zero (95 %); seed {first['seed']}"
     )
 
 
-def print_evaluation(found: Evaluation, data: Path, *, aside: bool = False, details: bool = False) -> None:
+def print_evaluation(found: Evaluation, data: Path, *, details: bool = False) -> None:
     """Print the baselines and the agent of an evaluation as :func:`print_metrics` does."""
     others = [baseline.numbers() for baseline in found.baselines if baseline.agent != found.agent]
-    print_metrics([*others, found.numbers()], str(data), aside=aside, details=details)
-
-
-def metrics_table(rows: Sequence[Mapping[str, Any]], title: str = "", first: str = "agent") -> Table:
-    """The table of some agents' records, each with its name as `agent`; the first column has the heading `first`."""
-    from rich.box import SIMPLE_HEAD
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=escape(title) or None, box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    table.add_column(escape(first), no_wrap=True)
-    for _, heading, _ in COLUMNS:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in rows:
-        cells = [
-            number_cell(row[name], row.get(f"{name}_se"), digits, row.get(f"{name}_bound"))
-            for name, _, digits in COLUMNS
-        ]
-        table.add_row(escape(row["agent"]), *cells)
-    return table
+    print_metrics([*others, found.numbers()], str(data), details=details)
 
 
 def short_name(agent: str) -> str:

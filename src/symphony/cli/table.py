@@ -2,65 +2,54 @@
 
 from __future__ import annotations
 
-import sys
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import arg
 
-from symphony.cli.shared import ResultFile
+from symphony.cli import shared
 from symphony.config import Method, PaperData, Setting, TableColumns, TableFormat
 from symphony.errors import ConfigError
-from symphony.files import write_file
 
 NAMED = 5
 """Runs left out for the same reason that are named."""
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(shared.Command):
     """Build one of the paper's tables from runs that `symphony evaluate` (or a recipe) has evaluated.
 
     A row for each method there is, mean and standard error over its seeds, the best of the BC methods and of the
     MGAIL methods in bold. Runs of other settings are left out.
     """
 
+    #: Setting of the table. `main`: 10 s, 2 interactive agents; `long`: 20 s; `many`: 8 interactive agents.
     setting: Setting
-    """Setting of the table. `main`: 10 s, 2 interactive agents; `long`: 20 s; `many`: 8 interactive agents."""
-    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DIR ...", help_behavior_hint="(required)")] = ()
-    """Folders of runs, or folders that hold some."""
-    evaluation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """Name of the evaluation of a run that counts, where it keeps several (in its folder `evaluations`); * and ?
-    stand for anything. Of several names, the first that fits one decides."""
+    #: Folders of runs, or folders that hold some.
+    runs: Annotated[shared.Paths, arg(metavar="DIR ...")] = ()
+    #: Name of the evaluation of a run that counts, where it keeps several (in its folder `evaluations`); * and ?
+    #: stand for anything. Of several names, the first that fits one decides.
+    evaluation: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
+    #: Write a row for each way that a method was simulated in (of those that `evaluation` fits), with its cost.
     each: bool = False
-    """Write a row for each way that a method was simulated in (of those that `evaluation` fits), with its cost."""
+    #: More columns: `split`, collisions with playback agents and the rest; `standing`, agents that stand at the
+    #: end; `corrected`, the divergence without its bias; `goals`, what the search made of the drawn goals.
     columns: tuple[TableColumns, ...] = ()
-    """More columns: `split`, collisions with playback agents and the rest; `standing`, agents that stand at the end;
-    `corrected`, the divergence without its bias; `goals`, what the search made of the drawn goals."""
-    paper: PaperData | None = None
-    """Show the paper's own figures on this data set beside ours."""
-    paired: Annotated[Method | None, tyro.conf.arg(metavar="METHOD")] = None
-    """Also print every method less this one, paired over run segments, to standard error."""
+    paper: PaperData | None = None  # Data set on which the paper's own figures are shown beside ours.
+    #: Method that every other is compared with, paired over run segments; printed on standard error.
+    paired: Annotated[Method | None, arg(metavar="METHOD")] = None
+    #: Print, instead of the table, which of the paper's relations between the methods hold, with paired errors.
     relations: bool = False
-    """Print, instead of the table, which of the paper's relations between the methods hold, with paired errors."""
-    format: TableFormat = "text"
-    """Format of the table."""
-    out: ResultFile = None
-    """File to write the table to; otherwise it is printed."""
+    format: TableFormat = "text"  # Format of the table.
+    out: shared.ResultFile = None  # File to write the table to; otherwise it is printed.
 
     def __post_init__(self) -> None:
-        if not self.runs:
-            raise ConfigError("no runs given: --runs DIR ...")
         if self.each and (self.relations or self.paired is not None):
             raise ConfigError(
-                "relations and paired differences are of one evaluation of each run, not of each"
+                "--relations and --paired go without --each: they are of one evaluation of a run"
             )
         if self.relations and self.format == "latex":
             raise ConfigError("relations are written as text, markdown or json")
 
-    def run(self) -> None:
-        """Collect, compare and write."""
+    def __call__(self) -> None:
         from symphony.evaluation.formats import FORMATS
         from symphony.evaluation.relations import RELATION_FORMATS, paired_lines, relations
         from symphony.evaluation.table import collect, compare
@@ -68,16 +57,9 @@ class Table:
         entries, left_out = collect(self.runs, self.setting, self.evaluation, each=self.each)
         for reason, folders in left_out.items():
             more = f" and {len(folders) - NAMED} more" if len(folders) > NAMED else ""
-            sys.stderr.write(f"left out, {reason}: {', '.join(map(str, folders[:NAMED]))}{more}\n")
+            shared.tell(f"left out, {reason}: {', '.join(map(str, folders[:NAMED]))}{more}")
         comparison = compare(entries, self.setting, self.paper, self.columns)
-        if self.paired is not None:
-            for line in paired_lines(entries, self.paired):
-                sys.stderr.write(f"{line}\n")
-        if self.relations:
-            text = RELATION_FORMATS[self.format](relations(entries, self.setting))
-        else:
-            text = FORMATS[self.format](comparison)
-        if self.out is not None:
-            write_file(self.out, text)
-        else:
-            sys.stdout.write(text)
+        for line in [] if self.paired is None else paired_lines(entries, self.paired):
+            shared.tell(line)
+        related = RELATION_FORMATS[self.format](relations(entries, self.setting)) if self.relations else ""
+        shared.write_text(self.out, related or FORMATS[self.format](comparison))

@@ -3,52 +3,44 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import arg
 
-from symphony.cli.shared import say
-from symphony.config import Profile, TrainConfig
-from symphony.config.profiles import WORDS
+import symphony
+from symphony.cli import shared
+from symphony.config import TrainConfig
+from symphony.config.profiles import WORDS, Profile
 
 
-@dataclass(frozen=True)
-class Train:
+class Train(shared.Command):
     """Learn agents from a store of run segments."""
 
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
-    profile: Annotated[Profile, tyro.conf.arg(help=WORDS)] = "default"
+    config: Annotated[TrainConfig, arg(name="")]
+    profile: Annotated[Profile, arg(help=WORDS)] = "default"
 
-    def run(self) -> None:
-        """Train them."""
-        from symphony.recipes import train
-
-        folder = train(self.config)
+    def __call__(self) -> None:
+        folder = symphony.train(self.config)
         # Of the processes that torchrun starts, one speaks.
         if os.environ.get("RANK", "0") == "0":
-            say("\n".join(last_words(folder, self.config)))
+            shared.say("\n".join(last_words(folder, self.config)))
 
 
 def last_words(folder: Path, config: TrainConfig) -> list[str]:
-    """Which checkpoint of a run is its agent and how good it is, where its pictures are, and what to do next."""
+    """Which checkpoint of a run is its agent and how good it is, and what to do next."""
     from symphony.agents.choice import best_of, choose
 
-    best = best_of(choose(folder, "last"))
-    if best is None:
-        score = "the last one; nothing was validated, see --validation.data"
-    else:
-        score = (
-            f"the best one, with collision rate plus off-road time of {best.infractions:.2f} % on segments of "
-            f"{config.validation.data} (at most {config.validation.segments})"
-        )
-    pictures = sorted((folder / "media").glob("rollout-*.gif"))
-    shown = f"{pictures[-1]}, the newest of {len(pictures)}" if pictures else "none, see --preview.every"
+    best, score = (
+        best_of(choose(folder, "last")),
+        "the last one; nothing was validated, see --validation.data",
+    )
+    if best is not None:
+        data = f"segments of {config.validation.data} (at most {config.validation.segments})"
+        score = f"the best one, with collision rate plus off-road time of {best.infractions:.2f} % on {data}"
     return [
         f"trained agent  {folder}",
         f"checkpoint     {choose(folder).name}: {score}",
-        f"pictures       {shown}",
         f"curves         symphony plot curves {folder} --out curves.png",
         f"evaluate it    symphony evaluate {folder} --data DIR",
     ]

@@ -1,38 +1,55 @@
-"""Ranges of settings."""
+"""What settings may be: their types say it, and it is checked when a configuration is made."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
-from typing import Any
+import functools
+import sys
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 from symphony.errors import ConfigError
 
 
-def positive(config: Any, *names: str) -> None:
-    """Raise ConfigError for a setting that is not positive and finite."""
-    _check(config, names, "be positive", lambda value: value > 0 and math.isfinite(value))
+class Bounds(NamedTuple):
+    """Marks a setting with the least and the most that it may be."""
+
+    least: float = 0.0
+    most: float = sys.float_info.max
 
 
-def not_negative(config: Any, *names: str) -> None:
-    """Raise ConfigError for a setting that is negative or not finite."""
-    _check(config, names, "not be negative", lambda value: value >= 0 and math.isfinite(value))
+class Names(tuple[str, ...]):
+    """Marks a setting that is one of some names, or an import path."""
 
 
-def at_most(config: Any, limit: int, *names: str) -> None:
-    """Raise ConfigError for a count beyond what any machine could hold, say in the file of an agent."""
-    _check(config, names, f"be at most {limit}", lambda value: value <= limit)
+Count = Annotated[int, Bounds(1)]
+Natural = Annotated[int, Bounds()]
+Positive = Annotated[float, Bounds(sys.float_info.min)]
+NotNegative = Annotated[float, Bounds()]
 
 
-def _check(config: Any, names: Iterable[str], rule: str, holds: Any) -> None:
-    for name in names:
-        if not holds(value := getattr(config, name)):
-            raise ConfigError(f"{name.replace('_', '-')} must {rule}, is {value}")
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Base of configurations; ConfigError for a setting that its type does not allow."""
+
+    def __post_init__(self) -> None:
+        kind: Any = type(self)
+        for name, hint in type_hints(kind).items():
+            value, told = getattr(self, name), name.replace("_", "-")
+            for mark in getattr(hint, "__metadata__", ()):
+                if isinstance(mark, Bounds) and not mark.least <= value <= mark.most:
+                    least = "not be negative" if mark.least == 0 else f"be at least {mark.least}"
+                    least = "be positive" if mark.least > 0 else least
+                    rule = f"be at most {mark.most}" if value > mark.most else least
+                    raise ConfigError(f"{told} must {rule}, is {value}")
+                if isinstance(mark, Names) and value not in mark and ":" not in value:
+                    more = "or an import path such as my.module:Name"
+                    raise ConfigError(f"{told} is one of {', '.join(mark)} {more}, not '{value}'")
+            plain = hint.__origin__ if get_origin(hint) is Annotated else hint
+            if get_origin(plain) is Literal and value not in get_args(plain):
+                raise ConfigError(f"{told} is one of {', '.join(get_args(plain))}, not '{value}'")
 
 
-def one_of(config: Any, name: str, known: Iterable[str], *, path: bool = False) -> None:
-    """Raise ConfigError for a setting that is no known name, nor, with `path`, an import path."""
-    value, known = getattr(config, name), list(known)
-    if value not in known and not (path and ":" in value):
-        more = " or an import path such as my.module:Name" if path else ""
-        raise ConfigError(f"{name.replace('_', '-')} is one of {', '.join(known)}{more}, not '{value}'")
+@functools.cache
+def type_hints(kind: Any) -> dict[str, Any]:
+    """Annotations of a class by the names of its fields, with their marks; compiles them once."""
+    return get_type_hints(kind, include_extras=True)

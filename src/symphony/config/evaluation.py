@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, Self
 
-from symphony.config.agent import RULES, SearchConfig
-from symphony.config.checks import not_negative, one_of, positive
+from symphony.config.agent import SearchConfig
+from symphony.config.checks import Count, Names, Natural, NotNegative, Positive, Settings
 from symphony.errors import ConfigError
 
 Search = Literal["agent", "none", "tree", "backtrack", "best"]
@@ -35,23 +35,15 @@ PERSONA_PARTS = ("headway", "speed")
 
 
 def persona_quantiles(text: str) -> dict[str, float]:
-    """From ``headway=.8,speed=.3`` to numbers by name; either may be missing.
-
-    Raises:
-        ConfigError: it can't be read, names something twice, or a number is not between 0 and 1.
-    """
-    found: dict[str, float] = {}
-    for part in text.split(",") if text else []:
-        name, _, number = part.partition("=")
-        twice = name in found
-        try:
-            found[name] = float(number)
-        except ValueError:
-            found[name] = -1.0
-        if twice or name not in PERSONA_PARTS or not 0 <= found[name] <= 1:
-            raise ConfigError(
-                f"a persona is such as headway=.8,speed=.3 (quantiles from 0 to 1), not '{text}'"
-            )
+    """From ``headway=.8,speed=.3`` to numbers from 0 to 1 by name; ConfigError for anything else."""
+    try:
+        pairs = [part.partition("=") for part in text.split(",") if text]
+        found = {name: float(number) for name, _, number in pairs}
+    except ValueError:
+        found = {"": -1.0}
+    good = found.keys() <= {*PERSONA_PARTS} and all(0 <= number <= 1 for number in found.values())
+    if not good or text.count("=") > len(found):
+        raise ConfigError(f"a persona is such as headway=.8,speed=.3 (quantiles from 0 to 1), not '{text}'")
     return found
 
 
@@ -62,47 +54,35 @@ def check_planner_seconds(seconds: float) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulationConfig:
+class SimulationConfig(Settings):
     """How an agent is simulated, whatever the rollouts are for."""
 
+    #: Search that the rollouts come from. `agent`: as the agent was trained; `none`; `tree`: beam
+    #: search; `backtrack`: independent rollouts, each of which goes back and tries again where it is bad; `best`:
+    #: independent rollouts, of which that with the best score counts.
     search: Search = "agent"
-    """Search that the rollouts come from. `agent`: as the agent was trained; `none`; `tree`: beam search;
-    `backtrack`: independent rollouts, each of which goes back and tries again where it is bad; `best`: independent
-    rollouts, of which that with the best score counts."""
+    #: Score that a search lowers. `agent`: as is best for the agent (the discriminator, unless its card says
+    #: something else); `discriminator`: what the agent's own calls unreal; `flags`: collisions and time off the
+    #: road; `rule`: the same, and collisions within half a second, were everyone to keep speed and course.
     score: ScoreName = "agent"
-    """Score that a search lowers. `agent`: as is best for the agent (the discriminator, unless its card says
-    something else); `discriminator`: what the agent's own calls unreal; `flags`: collisions and time off the road;
-    `rule`: the same, and collisions within half a second, were everyone to keep speed and course."""
-    branches: int = 0
-    """Branches of each tree; 0: as many as the agent's `search.test-branches`."""
-    rule: str = "agent"
-    """Rule that prunes trees: `agent` as it was trained, else see `search.rule` of training."""
-    prune_every: int = 0
-    """Steps between prunings, or after which a rollout may go back; 0: as the agent was trained."""
-    temperature: float = 0.0
-    """Temperature of rule `systematic`; 0: as the agent was trained."""
+    branches: Natural = 0  # Branches of each tree; 0: as many as the agent's `search.test-branches`.
+    #: Rule that prunes trees: `agent` as it was trained, else see `search.rule` of training.
+    rule: Annotated[str, Names(["agent", "best", "systematic", "replace"])] = "agent"
+    #: Steps between prunings, or after which a rollout may go back; 0: as the agent was trained.
+    prune_every: Natural = 0
+    temperature: NotNegative = 0.0  # Temperature of rule `systematic`; 0: as the agent was trained.
+    #: Highest total of a good branch, for rule `replace` and for `backtrack`; by default as the agent was trained,
+    #: and 0 where a score is 1 for each agent that is bad (`flags`, `rule`).
     threshold: float | None = None
-    """Highest total of a good branch, for rule `replace` and for `backtrack`; by default as the agent was trained,
-    and 0 where a score is 1 for each agent that is bad (`flags`, `rule`)."""
+    #: Branches that draw goals together: all of a `tree` (the paper), or each `branch` alone; `agent`: as the agent
+    #: is meant to.
     goals: Goals = "agent"
-    """Branches that draw goals together: all of a `tree` (the paper), or each `branch` alone; `agent`: as the agent
-    is meant to."""
-    action_temperature: float = 1.0
-    """Temperature of the draw of discrete actions: below 1 likely ones become likelier, above 1 the rare ones."""
-    seed: int = 0
-    """Seed of everything that is drawn at random in the rollouts."""
-    device: str = "cpu"
-    """Device that simulates: `cpu`, `cuda` or `cuda:N`."""
-    workers: int = 1
-    """Processes that share the batches of run segments, with one thread each (changes speed, not results)."""
-
-    def __post_init__(self) -> None:
-        one_of(self, "search", get_args(Search))
-        one_of(self, "score", get_args(ScoreName))
-        one_of(self, "goals", get_args(Goals))
-        one_of(self, "rule", ["agent", *RULES], path=True)
-        positive(self, "workers", "action_temperature")
-        not_negative(self, "branches", "prune_every", "temperature")
+    #: Temperature of the draw of discrete actions: below 1 likely ones become likelier, above 1 the rare ones.
+    action_temperature: Positive = 1.0
+    seed: int = 0  # Seed of everything that is drawn at random in the rollouts.
+    device: str = "cpu"  # Device that simulates: `cpu`, `cuda` or `cuda:N`.
+    #: Processes that share the batches of run segments, with one thread each (changes speed, not results).
+    workers: Count = 1
 
     @property
     def simulation(self) -> dict[str, Any]:
@@ -111,65 +91,52 @@ class SimulationConfig:
 
     def pruning(self, trained: SearchConfig) -> SearchConfig:
         """The search: as in training, but for what is set here."""
-        score = trained.score if self.score == "agent" else self.score
+        names = ("score", "rule", "prune_every", "temperature", "goals")
+        asked = {"test_branches": self.branches} | {name: getattr(self, name) for name in names}
+        given = {name: value for name, value in asked.items() if value not in ("agent", 0)}
         # A threshold of logits says nothing of flags: with one of them a branch is bad.
-        threshold = trained.threshold if score == "discriminator" else 0.0
-        return dataclasses.replace(
-            trained,
-            score=score,
-            test_branches=self.branches or trained.test_branches,
-            rule=trained.rule if self.rule == "agent" else self.rule,
-            prune_every=self.prune_every or trained.prune_every,
-            temperature=self.temperature or trained.temperature,
-            threshold=threshold if self.threshold is None else self.threshold,
-            goals=trained.goals if self.goals == "agent" else self.goals,
-        )
+        own = trained.threshold if given.get("score", trained.score) == "discriminator" else 0.0
+        given["threshold"] = own if self.threshold is None else self.threshold
+        return dataclasses.replace(trained, **given)
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig(SimulationConfig):
     """How agents are evaluated."""
 
-    rollouts: int = 16
-    """Rollouts per run segment that count."""
-    trees: int = 1
-    """Search trees per run segment, each with goals of its own; each gives its share of the rollouts. Where that is
-    less than all of its leaves, take `goals` of the tree: among those of branches the discriminator would choose."""
+    rollouts: Count = 16  # Rollouts per run segment that count.
+    #: Search trees per run segment, each with goals of its own; each gives its share of the rollouts. Where that is
+    #: less than all of its leaves, take `goals` of the tree: among those of branches the discriminator would choose.
+    trees: Count = 1
+    #: Style of all agents that the agent drives, such as `headway=.8,speed=.3`: quantiles among the vehicles it
+    #: learned from; what is not given is drawn for each (agents trained with `agent.persona`).
     persona: str = ""
-    """Style of all agents that the agent drives, such as `headway=.8,speed=.3`: quantiles among the vehicles it
-    learned from; what is not given is drawn for each (agents trained with `agent.persona`)."""
-    logged_goals: bool = False
-    """Give agents the routes of the log instead of sampled ones."""
-    duration: int = 0
-    """Seconds of each run segment that are simulated; 0: as many as the agent was trained with."""
+    logged_goals: bool = False  # Give agents the routes of the log instead of sampled ones.
+    #: Seconds of each run segment that are simulated; 0: as many as the agent was trained with.
+    duration: Natural = 0
+    #: Agents per run segment that the agent drives, at most 128: the ego, then the nearest (in a segment with fewer
+    #: those that there are); 0: as many as it was trained with (2 for the baselines). `all`: every vehicle that moves
+    #: or stands in a lane, in open traffic.
     interactive: int | Literal["all"] = 0
-    """Agents per run segment that the agent drives, at most 128: the ego, then the nearest (in a segment with fewer
-    those that there are); 0: as many as it was trained with (2 for the baselines). `all`: every vehicle that moves or
-    stands in a lane, in open traffic."""
-    radius: float = 0.0
-    """Metres from the ego within which vehicles beyond the first two must come in the log to be driven; 0: no
-    limit."""
+    #: Metres from the ego within which vehicles beyond the first two must come in the log to be driven; 0: no limit.
+    radius: NotNegative = 0.0
+    #: Vehicles enter where the log brings them in and leave at the edge of the map, as they do with `all`; otherwise
+    #: the same ones are driven from the first step to the last.
     open_traffic: bool = False
-    """Vehicles enter where the log brings them in and leave at the edge of the map, as they do with `all`; otherwise
-    the same ones are driven from the first step to the last."""
+    #: Driver of the other vehicles: the `log`, `constant_velocity`, `idm` (a car-follower, along the route of the
+    #: log) or the agent itself (`learned`). Nobody evaluates them; traffic is open for all but the log.
     others: Others = "log"
-    """Driver of the other vehicles: the `log`, `constant_velocity`, `idm` (a car-follower, along the route of the
-    log) or the agent itself (`learned`). Nobody evaluates them; traffic is open for all but the log."""
+    #: Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout.
     metric: tuple[str, ...] = ()
-    """Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout."""
-    batch: int = 0
-    """Run segments simulated at a time (changes memory and speed, not results); 0: up to 64, or 16 with a
-    planner, fewer where their agents see many points."""
+    #: Run segments simulated at a time (changes memory and speed, not results); 0: up to 64, or 16 with a planner,
+    #: fewer where their agents see many points.
+    batch: Natural = 0
+    #: Engine that runs the worker processes: `local`, on this machine, or `ray`, on a Ray cluster (at RAY_ADDRESS,
+    #: else one is started here).
     engine: Engine = "local"
-    """Engine that runs the worker processes: `local`, on this machine, or `ray`, on a Ray cluster (at RAY_ADDRESS,
-    else one is started here)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        one_of(self, "engine", get_args(Engine))
-        one_of(self, "others", get_args(Others))
-        positive(self, "rollouts", "trees")
-        not_negative(self, "radius", "batch", "duration")
         if self.engine == "ray" and self.device != "cpu":
             raise ConfigError(f"engine 'ray' works on CPUs only, device is '{self.device}'")
         if self.rollouts % self.trees:
@@ -180,3 +147,46 @@ class EvaluateConfig(SimulationConfig):
         for path in self.metric:
             if ":" not in path:
                 raise ConfigError(f"metric is an import path such as my.metrics:jerk, not '{path}'")
+
+
+WosacScore = Literal["agent", "discriminator", "rule"]
+"""Scores without the true flags: what is simulated must not know beforehand what it is scored by."""
+FUTURE, DT = 80, 0.1
+"""Steps that the challenge asks for, and the seconds between them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WosacSettings(SimulationConfig):
+    """How the agent is simulated; each of the 32 rollouts of a search comes from a tree of its own."""
+
+    #: Score that a search lowers. `agent`: as is best for the agent; `discriminator`: what the agent's own calls
+    #: unreal; `rule`: collisions, also those within half a second, were everyone to keep speed and course, and time
+    #: off the road.
+    score: WosacScore = "agent"
+    #: Give agents the routes of the log instead of sampled ones; of the score alone, since it tells them the future.
+    logged_goals: bool = False
+    #: Seconds that are simulated and scored: the challenge's 8, or less for logs that are shorter. Scores of another
+    #: horizon are those of an easier task; a submission has 8.
+    horizon: float = 8.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.seed < 0:
+            raise ConfigError(f"seed must not be negative, is {self.seed}")
+        if not 1.0 <= self.horizon <= FUTURE * DT or abs(self.horizon / DT - self.future) > 1e-6:
+            raise ConfigError(f"horizon is 1 to 8 s, in steps of {DT:g} s, is {self.horizon:g}")
+
+    @property
+    def future(self) -> int:
+        """Steps that are simulated and scored."""
+        return round(self.horizon / DT)
+
+    @classmethod
+    def of(cls, config: EvaluateConfig) -> Self:
+        """The same simulation, of everyone; ConfigError where it searches by the true flags."""
+        return cls(**config.simulation, logged_goals=config.logged_goals)
+
+    def config(self, rollouts: int, seed: int) -> EvaluateConfig:
+        """The settings of some rollouts, each from a tree of its own where there is a search."""
+        same = self.simulation | {"logged_goals": self.logged_goals, "seed": seed}
+        return EvaluateConfig(**same, rollouts=rollouts, trees=rollouts)

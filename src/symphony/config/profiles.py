@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -54,9 +53,7 @@ def expanded(args: Sequence[str]) -> list[str]:
         elif word.startswith("--profile="):
             name = word.removeprefix("--profile=")
     if name not in PROFILES:
-        close = difflib.get_close_matches(name, PROFILES, 1)
-        hint = f", did you mean '{close[0]}'?" if close else ""
-        raise ConfigError(f"profile is one of {', '.join(PROFILES)}, not '{name}'{hint}")
+        raise ConfigError(f"profile is one of {', '.join(PROFILES)}, not '{name}'")
     given = {word.split("=")[0].replace("_", "-") for word in args}
     options = (f"--{option}".split() for option in PROFILES[name].split("--") if option.strip())
     return [*args, *(word for words in options if words[0] not in given for word in words)]

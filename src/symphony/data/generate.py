@@ -298,10 +298,3 @@ def _begun(store: SegmentStore, settings: Mapping[str, Any]) -> Generation:
 def _report(writer: StoreWriter, settings: Mapping[str, Any], state: Generation) -> None:
     counts = {"converted": len(writer), "files": state.networks}
     writer.write_report({**counts, "settings": settings, "generation": asdict(state)})
-
-
-def add_to_report(path: str | Path, name: str, value: Any) -> None:
-    """Keep something more in the report of a store."""
-    store = SegmentStore(path)
-    with StoreWriter(path, append=True) as writer:
-        writer.write_report({**store.report, name: value})

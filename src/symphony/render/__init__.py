@@ -12,16 +12,8 @@ if TYPE_CHECKING:
     from symphony.render.video import animate_rollouts, draw_clips
 
 __all__ = [
-    "Clip",
-    "animate_rollouts",
-    "draw_clips",
-    "plot_curvature",
-    "plot_curves",
-    "plot_grid",
-    "plot_rollout",
-    "plot_routes",
-    "plot_segment",
-    "saved_clip",
-]
+    "Clip", "animate_rollouts", "draw_clips", "plot_curvature", "plot_curves", "plot_grid", "plot_rollout",
+    "plot_routes", "plot_segment", "saved_clip",
+]  # fmt: skip
 
 __getattr__, __dir__ = lazily(__name__)

@@ -23,18 +23,17 @@ def place(
 
     Args:
         shape: [V, 2] along and left of the heading, as fractions of length and width.
-        position: [A, 2] box centres, metres.
+        position: [A, 2 or more] box centres, metres.
         heading: [A] radians.
-        size: [A, 2 or 3] length, width, metres.
+        size: [A, 2 or more] length, width, metres.
 
     Returns:
         [A, V, 2] world coordinates.
     """
     local = shape * size[:, None, :2]
-    cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
-    x = local[..., 0] * cos - local[..., 1] * sin
-    y = local[..., 0] * sin + local[..., 1] * cos
-    return np.stack([x, y], -1) + position[:, None, :2]
+    ahead = np.stack([np.cos(heading), np.sin(heading)], -1)[:, None]
+    left = np.stack([-ahead[..., 1], ahead[..., 0]], -1)
+    return local[..., :1] * ahead + local[..., 1:] * left + position[:, None, :2]
 
 
 def draw_boxes(
@@ -49,27 +48,15 @@ def draw_boxes(
     gid: str | None = None,
 ) -> None:
     """Draw boxes [A] whose pale wedge points ahead (see :func:`place` for the arrays); the ego has a dark outline."""
-    boxes = place(CORNERS, position, heading, size)
     ego = color == AGENT_COLORS[0]
-    edge = INK if ego else "white" if alpha > 0.5 else color
-    axes.add_collection(
-        PolyCollection(
-            list(boxes),
-            facecolors=[to_rgba(color, alpha)],
-            edgecolors=[to_rgba(edge, min(1.0, alpha + 0.3))],
-            linewidths=1.2 if ego else 0.7,
-            zorder=zorder,
-            gid=gid,
-        ),
-        autolim=False,
-    )
-    noses = place(NOSE, position, heading, size)
-    axes.add_collection(
-        PolyCollection(
-            list(noses), facecolors=[to_rgba("white", 0.85 * alpha)], edgecolors="none", zorder=zorder + 0.1
-        ),
-        autolim=False,
-    )
+    edge = to_rgba(INK if ego else "white" if alpha > 0.5 else color, min(1.0, alpha + 0.3))
+    style: dict[str, Any] = {"edgecolors": [edge], "linewidths": 1.2 if ego else 0.7, "gid": gid}
+    for shape, face, more in (
+        (CORNERS, to_rgba(color, alpha), {**style, "zorder": zorder}),
+        (NOSE, to_rgba("white", 0.85 * alpha), {"edgecolors": "none", "zorder": zorder + 0.1}),
+    ):
+        boxes = list(place(shape, position, heading, size))
+        axes.add_collection(PolyCollection(boxes, facecolors=[face], **more), autolim=False)
 
 
 def pieces(path: NDArray[Any], valid: NDArray[Any] | None = None) -> tuple[NDArray[Any], NDArray[np.int64]]:
@@ -107,9 +94,6 @@ def draw_trails(
         found, begin = pieces(path, None if valid is None else valid[k])
         lines.extend(found)
         alphas.extend(strength * (1 - 0.8 * np.abs(begin + 0.5 - step) / reach))
-    if lines:
-        colors = [to_rgba(color, float(np.clip(a, 0, 1))) for a in alphas]
-        axes.add_collection(
-            LineCollection(lines, colors=colors, linewidths=width, zorder=zorder, capstyle="butt", gid=gid),
-            autolim=False,
-        )
+    colors = [to_rgba(color, float(np.clip(a, 0, 1))) for a in alphas]
+    drawn = LineCollection(lines, colors=colors, linewidths=width, zorder=zorder, capstyle="butt", gid=gid)
+    axes.add_collection(drawn, autolim=False)

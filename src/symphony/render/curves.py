@@ -33,10 +33,8 @@ PANELS: dict[str, tuple[str, ...]] = {
     "discriminator logit": ("discriminator_score_simulated", "discriminator_score_data"),
     "search: share in collision": ("search_collision_all", "search_collision_kept"),
     "search: share off the road": ("search_offroad_all", "search_offroad_kept"),
-    "validation: infractions, %": (
-        "validation_collision_rate",
-        "validation_offroad_time",
-        "validation_infractions",
+    "validation: infractions, %": tuple(
+        f"validation_{name}" for name in ("collision_rate", "offroad_time", "infractions")
     ),
     "validation: displacement, m": ("validation_ade", "validation_min_sade"),
     "gradient norm": ("gradient_norm_policy", "gradient_norm_discriminator", "gradient_norm_goals"),
@@ -46,10 +44,8 @@ LAST = ("updates_per_second", "learning_rate", "skipped_updates")
 """Metrics that say how the training ran; their panels come last."""
 DASHES: tuple[Any, ...] = ("-", (0, (3, 1.5)), (0, (1, 1)))
 LOG_COLOR, POLICY_COLOR = "#0072B2", "#E69F00"
-TITLE = 40
-"""Characters of a line above a panel of curvature."""
-LEAST_REACH = 0.1
-"""Curvature in 1/m that is shown to either side, at least."""
+TITLE, LEAST_REACH = 40, 0.1
+"""Of a panel of curvature: characters of a line above, and 1/m that are shown to either side at least."""
 
 
 def plot_curves(
@@ -70,9 +66,11 @@ def plot_curves(
         columns: panels per row, at most.
 
     Raises:
-        ConfigError: nothing to draw, a metric that no run has, or a file of another kind.
+        ConfigError: nothing to draw, a metric that no run has, a window out of range, or a file of another kind.
     """
     file = picture_path(path)
+    if not 0 <= window <= 1:
+        raise ConfigError(f"window must be from 0 to 1, is {window}")
     curves = {name: read_curves(records) for name, records in runs.items()}
     present = list(dict.fromkeys(metric for found in curves.values() for metric in found))
     if missing := [metric for metric in metrics if metric not in present]:
@@ -87,24 +85,21 @@ def plot_curves(
         for run, found in curves.items():
             for name, dashes in zip(names, DASHES, strict=False):
                 if name in found:
-                    _draw_curve(
-                        axes, *found[name], window, f"{name}-{run}", color=colors[run], linestyle=dashes
-                    )
+                    style = {"color": colors[run], "linestyle": dashes}
+                    _draw_curve(axes, *found[name], window, f"{name}-{run}", **style)
         axes.grid(color=LANE, linewidth=0.4, alpha=0.6)
         axes.set_axisbelow(True)
         axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
         if len(names) > 1:
-            styles = [
-                Line2D([], [], color=INK, linewidth=1.2, linestyle=dashes, label=name)
-                for name, dashes in zip(names, DASHES, strict=False)
-            ]
-            axes.legend(handles=styles, fontsize=6.5, framealpha=0.8, edgecolor="none", handlelength=2.2)
+            ink: dict[str, Any] = {"color": INK, "linewidth": 1.2}
+            pairs = zip(names, DASHES, strict=False)
+            lines = [Line2D([], [], linestyle=dashes, label=name, **ink) for name, dashes in pairs]
+            axes.legend(handles=lines, fontsize=6.5, framealpha=0.8, edgecolor="none", handlelength=2.2)
     for axes in slots[-columns:]:
         axes.set_xlabel("update", fontsize=8, color=INK)
     handles = [Line2D([], [], color=color, linewidth=2.5, label=name) for name, color in colors.items()]
-    figure.legend(
-        handles=handles, loc="outside upper left", ncols=min(len(handles), columns), frameon=False, fontsize=9
-    )
+    place: dict[str, Any] = {"loc": "outside upper left", "ncols": min(len(handles), columns)}
+    figure.legend(handles=handles, frameon=False, fontsize=9, **place)
     save(figure, file)
     return figure
 

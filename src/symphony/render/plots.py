@@ -82,19 +82,11 @@ def plot_segment(
     draw_trails(axes, position[others], valid[others], PLAYBACK, step=step, width=0.9, strength=0.6, zorder=7)
     draw_playback(axes, segment, step, others)
     for agent, color in zip(chosen, colors_of(segment, chosen), strict=True):
-        one = [agent]
-        draw_trails(
-            axes, position[one], valid[one], color, step=step, width=2.2, zorder=8, gid=f"trail-{agent}"
-        )
+        one, gid = [agent], f"trail-{agent}"
+        draw_trails(axes, position[one], valid[one], color, step=step, width=2.2, gid=gid)
         if valid[agent, step]:
-            draw_boxes(
-                axes,
-                position[one, step],
-                segment.heading[one, step],
-                segment.size[one],
-                color,
-                gid=f"box-{agent}",
-            )
+            at = position[one, step], segment.heading[one, step], segment.size[one]
+            draw_boxes(axes, *at, color, gid=f"box-{agent}")
     seconds = step * segment.dt
     frame(axes, view, title or segment.segment_id, f"{describe(segment)}   ·   shown at {seconds:.1f} s")
     add_legend(axes, [*agent_entries(segment, chosen), playback_entry(), *entries], trails)
@@ -135,9 +127,8 @@ class Clip:
         agents = np.asarray(self.agents, np.int64)
         kept, shape = agents >= 0, self.heading.shape
         self.agents = agents[kept]
-        self.position, self.heading = (
-            np.asarray(part, np.float64)[:, kept] for part in (self.position, self.heading)
-        )
+        self.position = np.asarray(self.position, np.float64)[:, kept]
+        self.heading = np.asarray(self.heading, np.float64)[:, kept]
         self.valid, self.collision, self.offroad = (
             np.broadcast_to(flags, shape)[:, kept] for flags in (self.valid, self.collision, self.offroad)
         )
@@ -357,12 +348,9 @@ def draw_hit(axes: Axes, clip: Clip) -> Patch | None:
         step = clip.start + at
         near = clip.others[segment.valid[clip.others, step]]
         size = segment.size[clip.agents[[rank]]]
-        own = shapely.Polygon(
-            place(CORNERS, clip.position[[rollout], rank, at], clip.heading[[rollout], rank, at], size)[0]
-        )
-        boxes = shapely.polygons(
-            place(CORNERS, segment.position[near, step], segment.heading[near, step], segment.size[near])
-        )
+        here = clip.position[[rollout], rank, at], clip.heading[[rollout], rank, at], size
+        there = segment.position[near, step], segment.heading[near, step], segment.size[near]
+        own, boxes = shapely.Polygon(place(CORNERS, *here)[0]), shapely.polygons(place(CORNERS, *there))
         found |= {(int(agent), step) for agent in near[shapely.intersects(own, boxes)]}
     if not found:
         return None
@@ -390,9 +378,8 @@ def colors_of(segment: RunSegment, agents: Any) -> list[str]:
 def describe(segment: RunSegment) -> str:
     """Source, duration, rate and agents of a segment, for a caption."""
     duration = (segment.num_steps - 1) * segment.dt
-    return (
-        f"{segment.source}   ·   {duration:.1f} s at {1 / segment.dt:g} Hz   ·   {segment.num_agents} agents"
-    )
+    rate, agents = f"{1 / segment.dt:g} Hz", f"{segment.num_agents} agents"
+    return f"{segment.source}   ·   {duration:.1f} s at {rate}   ·   {agents}"
 
 
 def agent_entries(segment: RunSegment, agents: Any) -> list[Patch]:

@@ -45,6 +45,13 @@ COLUMNS = {
     "log_distance": "to log m",
 }
 """Columns of the table of runs: the name of a number and its heading."""
+EVENTS = {
+    "red_lights": "red light",
+    "offroad_time": "off road",
+    "wrong_way_time": "wrong way",
+    "blocking_time": "blocks traffic",
+}
+"""What is said of a run where a number is not 0."""
 LEAD = 2.0
 """Seconds before the first event of a run at which its replay begins."""
 
@@ -114,14 +121,7 @@ def _run(row: Mapping[str, Any], viewer: str | None) -> dict[str, Any]:
         what.append(f"failed: {row['failed']}")
     elif row["collision"]:
         what.append("collision, at fault" if row["at_fault_collision"] else "collision, not at fault")
-    if row.get("red_lights"):
-        what.append("red light")
-    if row.get("offroad_time"):
-        what.append("off road")
-    if row.get("wrong_way_time"):
-        what.append("wrong way")
-    if row.get("blocking_time"):
-        what.append("blocks traffic")
+    what += [words for name, words in EVENTS.items() if row.get(name)]
     shown["what"] = ", ".join(what)
     # A run of which nothing was saved has no replay.
     if viewer is not None and row.get("steps") is not None:

@@ -44,18 +44,17 @@ def draw_roads(axes: Axes, road: RoadMap, view: View) -> list[Line2D]:
         axes.add_patch(PathPatch(outline(polygon), facecolor=ROAD, edgecolor="none", zorder=1, gid="surface"))
     entries = _draw_marks(axes, road, view)
     lanes = [road.lanes[k][:, :2] for k in _visible(road.lanes, view)]
-    axes.add_collection(
-        LineCollection(lanes, colors=LANE, linewidths=0.6, zorder=3, gid="lanes"), autolim=False
-    )
-    chevrons = [arrow for lane in lanes for arrow in lane_arrows(lane)]
-    axes.add_collection(
-        LineCollection(chevrons, colors="#AEB4BC", linewidths=0.7, zorder=3, gid="directions"), autolim=False
-    )
     edges = [road.boundary[k][:, :2] for k in _visible(road.boundary, view)]
-    axes.add_collection(
-        LineCollection(edges, colors=BOUNDARY, linewidths=1.2, zorder=4, gid="boundary"), autolim=False
-    )
+    chevrons = [arrow for lane in lanes for arrow in lane_arrows(lane)]
+    _draw_lines(axes, lanes, LANE, 0.6, 3, "lanes")
+    _draw_lines(axes, chevrons, "#AEB4BC", 0.7, 3, "directions")
+    _draw_lines(axes, edges, BOUNDARY, 1.2, 4, "boundary")
     return entries
+
+
+def _draw_lines(axes: Axes, lines: Any, color: str, width: float, zorder: float, gid: str) -> None:
+    drawn = LineCollection(lines, colors=color, linewidths=width, zorder=zorder, gid=gid)
+    axes.add_collection(drawn, autolim=False)
 
 
 def draw_signals(axes: Axes, segment: RunSegment, step: int, view: View) -> list[Line2D]:
@@ -73,18 +72,10 @@ def draw_signals(axes: Axes, segment: RunSegment, step: int, view: View) -> list
             style: dict[str, Any] = {"marker": marker, "zorder": 6, "linewidths": 0.7, "edgecolors": "white"}
             axes.scatter(point[chosen, 0], point[chosen, 1], s=26, c=color, gid=f"signals-{name}", **style)
             entries.append(_marker_entry(marker, color, f"light: {name}"))
-    unknown = inside & (state == SignalState.UNKNOWN)
-    if unknown.any():
-        axes.scatter(
-            point[unknown, 0],
-            point[unknown, 1],
-            s=16,
-            c="none",
-            edgecolors=INK,
-            linewidths=0.6,
-            zorder=6,
-            gid="signals-unknown",
-        )
+    x, y = point[inside & (state == SignalState.UNKNOWN)].T
+    if len(x):
+        style = {"edgecolors": INK, "linewidths": 0.6, "zorder": 6, "gid": "signals-unknown"}
+        axes.scatter(x, y, s=16, c="none", **style)
     return entries
 
 
@@ -99,31 +90,20 @@ def _draw_marks(axes: Axes, road: RoadMap, view: View) -> list[Line2D]:
         if kind == MarkType.STOP_SIGN:
             signs.append(points[0])
         elif kind in {MarkType.CROSSWALK, MarkType.SPEED_BUMP, MarkType.DRIVEWAY} and len(points) > 2:
-            stripes = "||||" if kind == MarkType.CROSSWALK else None
-            axes.add_patch(
-                PathPatch(
-                    Outline(np.concatenate([points, points[:1]]), closed=True),
-                    facecolor="#EFEDE8",
-                    edgecolor=MARK,
-                    hatch=stripes,
-                    linewidth=0.5,
-                    zorder=2,
-                    gid=f"mark-{MarkType(kind).name.lower()}",
-                )
-            )
+            style: dict[str, Any] = {"facecolor": "#EFEDE8", "edgecolor": MARK, "linewidth": 0.5, "zorder": 2}
+            style |= {"hatch": "||||"} if kind == MarkType.CROSSWALK else {}
+            area = Outline(np.concatenate([points, points[:1]]), closed=True)
+            axes.add_patch(PathPatch(area, gid=f"mark-{MarkType(kind).name.lower()}", **style))
         else:
             lines.append(points)
-    axes.add_collection(
-        LineCollection(lines, colors=MARK, linewidths=0.8, zorder=2, gid="marks"), autolim=False
-    )
+    _draw_lines(axes, lines, MARK, 0.8, 2, "marks")
     if not signs:
         return []
+    style = {"marker": "8", "edgecolors": STOP, "linewidths": 1.5, "zorder": 5, "gid": "stop-signs"}
     x, y = np.stack(signs).T
-    axes.scatter(
-        x, y, s=34, marker="8", c="white", edgecolors=STOP, linewidths=1.5, zorder=5, gid="stop-signs"
-    )
-    style: dict[str, Any] = {"linestyle": "none", "markersize": 5.5, "markeredgewidth": 1.5}
-    return [Line2D([], [], marker="8", color="white", markeredgecolor=STOP, label="stop sign", **style)]
+    axes.scatter(x, y, s=34, c="white", **style)
+    style = {"linestyle": "none", "markersize": 5.5, "markeredgewidth": 1.5, "markeredgecolor": STOP}
+    return [Line2D([], [], marker="8", color="white", label="stop sign", **style)]
 
 
 def road_ribbon(road: RoadMap, lane: int) -> Any:
@@ -157,9 +137,7 @@ def lane_arrows(line: NDArray[Any], spacing: float = ARROW_SPACING) -> NDArray[A
 def outline(polygon: Any) -> Outline:
     """A polygon with its holes as one path."""
     rings = [polygon.exterior, *polygon.interiors]
-    return Outline.make_compound_path(
-        *(Outline(np.asarray(ring.coords)[:, :2], closed=True) for ring in rings)
-    )
+    return Outline.make_compound_path(*(Outline(np.asarray(r.coords)[:, :2], closed=True) for r in rings))
 
 
 def _visible(lines: Polylines, view: View) -> Iterator[int]:

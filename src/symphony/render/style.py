@@ -21,31 +21,13 @@ from symphony.files import replacing
 
 # From Okabe and Ito's and Tol's palettes: apart from each other, from playback and from the road for the
 # common kinds of colour blindness too.
-AGENT_COLORS = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#882255",
-    "#332288",
-    "#D9C400",
-    "#FF80FF",
-    "#9ADE6B",
-)
+AGENT_COLORS = ("#0072B2", "#D55E00", "#009E73", "#882255", "#332288", "#D9C400", "#FF80FF", "#9ADE6B")
 """The ego's, which is its alone, then the interactive agents', which repeat after the last."""
-PLAYBACK = "#A9AEB5"
-INK = "#2B2F36"
-LAND = "#F3F1EC"
-ROAD = "#FFFFFF"
-BOUNDARY = "#6F6A62"
-LANE = "#C9CDD3"
-MARK = "#DAD6CE"
-STOP = "#B3122B"
-CAUTION = "#E69F00"
-GO = "#009E73"
+PLAYBACK, INK, LAND, ROAD = "#A9AEB5", "#2B2F36", "#F3F1EC", "#FFFFFF"
+BOUNDARY, LANE, MARK = "#6F6A62", "#C9CDD3", "#DAD6CE"
+STOP, CAUTION, GO = "#B3122B", "#E69F00", "#009E73"
 
-FORMATS = ("png", "pdf", "svg")
-ANIMATIONS = ("gif",)
-FILMS = ("mp4",)
+FORMATS, ANIMATIONS, FILMS = ("png", "pdf", "svg"), ("gif",), ("mp4",)
 
 Corner = Literal["upper right", "upper left", "lower right"]
 Target = str | Path | Axes
@@ -80,9 +62,7 @@ def picture_path(path: str | Path, formats: Sequence[str] = FORMATS) -> Path:
     """The path, if its name says one of the kinds of picture that can be written."""
     path = Path(path)
     if path.suffix[1:].lower() not in formats:
-        raise ConfigError(
-            f"{path}: a picture's name must end in one of {', '.join('.' + f for f in formats)}"
-        )
+        raise ConfigError(f"{path}: a picture's name must end in one of .{', .'.join(formats)}")
     return path
 
 
@@ -165,20 +145,11 @@ def scale_length(span: float) -> float:
 
 def add_scale_bar(axes: Axes, view: View) -> None:
     """A bar of a round length in the lower left corner."""
-    length = scale_length(max(view[1] - view[0], view[3] - view[2]))
-    bar = AnchoredSizeBar(
-        axes.transData,
-        length,
-        f"{length:g} m",
-        "lower left",
-        pad=0.4,
-        borderpad=0.6,
-        sep=4,
-        frameon=True,
-        size_vertical=max(view[1] - view[0], view[3] - view[2]) / 250,
-        color=INK,
-        fontproperties=FontProperties(size=font(axes, 8.5)),
-    )
+    span = max(view[1] - view[0], view[3] - view[2])
+    length = scale_length(span)
+    style: dict[str, Any] = {"pad": 0.4, "borderpad": 0.6, "sep": 4, "frameon": True, "color": INK}
+    style |= {"size_vertical": span / 250, "fontproperties": FontProperties(size=font(axes, 8.5))}
+    bar = AnchoredSizeBar(axes.transData, length, f"{length:g} m", "lower left", **style)
     bar.patch.set(alpha=0.85, edgecolor="none")
     bar.set_zorder(20)
     axes.add_artist(bar)
@@ -186,15 +157,9 @@ def add_scale_bar(axes: Axes, view: View) -> None:
 
 def add_legend(axes: Axes, handles: Sequence[Line2D | Any], points: NDArray[Any]) -> None:
     """A legend above everything drawn, in the corner that hides the fewest of the points [P, 2]."""
-    legend = axes.legend(
-        handles=list(handles),
-        loc=free_corner(points, (*axes.get_xlim(), *axes.get_ylim())),
-        fontsize=font(axes, 8.5),
-        framealpha=0.9,
-        edgecolor="#C8C4BC",
-        handlelength=1.8,
-        borderpad=0.6,
-    )
+    place = free_corner(points, (*axes.get_xlim(), *axes.get_ylim()))
+    style: dict[str, Any] = {"framealpha": 0.9, "edgecolor": "#C8C4BC", "handlelength": 1.8, "borderpad": 0.6}
+    legend = axes.legend(handles=list(handles), loc=place, fontsize=font(axes, 8.5), **style)
     legend.set_zorder(20)
 
 

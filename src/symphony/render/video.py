@@ -21,21 +21,9 @@ from PIL import Image
 
 from symphony.errors import ConfigError
 from symphony.files import replacing
+from symphony.render import plots
 from symphony.render.agents import CORNERS, draw_boxes, place
-from symphony.render.plots import (
-    EVENTS,
-    LOG_DASHES,
-    Clip,
-    agent_entries,
-    colors_of,
-    describe,
-    draw_events,
-    draw_playback,
-    draw_ways,
-    playback_entry,
-    plot_grid,
-    plot_rollout,
-)
+from symphony.render.plots import Clip
 from symphony.render.roads import draw_roads, draw_signals
 from symphony.render.style import (
     ANIMATIONS,
@@ -78,7 +66,7 @@ def draw_clips(clips: Sequence[Clip], path: Path, columns: int = 3) -> None:
     elif kind in ANIMATIONS:
         animate_rollouts(clips, path, columns=columns)
     else:
-        plot_grid([partial(plot_rollout, clip) for clip in clips], path, columns=columns)
+        plots.plot_grid([partial(plots.plot_rollout, clip) for clip in clips], path, columns=columns)
 
 
 def write_film(clips: Sequence[Clip], path: Path, *, columns: int = 3, size: float = 5.0) -> None:
@@ -138,11 +126,8 @@ def frames_of(
     # Lay out once: what moves must not move the rest.
     figure.set_layout_engine("none")
     still = canvas.copy_from_bbox(figure.bbox)
-    above = [
-        canvas.copy_from_bbox(artist.get_window_extent().padded(1))
-        for panel in panels
-        for artist in panel.above()
-    ]
+    hidden = [artist.get_window_extent().padded(1) for panel in panels for artist in panel.above()]
+    above = [canvas.copy_from_bbox(box) for box in hidden]
     times, interval = _times(panels)
     frames = []
     for time in times:
@@ -171,18 +156,18 @@ class _Panel:
         """Draw what never moves."""
         self.axes, clip = axes, self.clip
         entries = draw_roads(axes, self.segment.road, self.view)
-        line: dict[str, Any] = {"color": INK, "linestyle": LOG_DASHES, "linewidth": 0.9}
+        line: dict[str, Any] = {"color": INK, "linestyle": plots.LOG_DASHES, "linewidth": 0.9}
         for agent, way in zip(clip.agents, clip.log, strict=True):
             axes.plot(*way.T, zorder=5, gid=f"log-{agent}", **line)
         # The blanks are room for the seconds.
-        caption = f"{describe(self.segment)}   ·   {clip.words()}"
+        caption = f"{plots.describe(self.segment)}   ·   {clip.words()}"
         frame(axes, self.view, clip.title or self.segment.segment_id, caption + " " * 12)
         axes.set_anchor("N")
         self.still = set(axes.get_children())
         marks = self._draw_moving(self.steps - 1)
         self._remove_moving()
-        legend = [*agent_entries(self.segment, clip.agents), Line2D([], [], label="log", **line)]
-        add_legend(axes, [*legend, playback_entry(), *marks, *entries], clip.points)
+        legend = [*plots.agent_entries(self.segment, clip.agents), Line2D([], [], label="log", **line)]
+        add_legend(axes, [*legend, plots.playback_entry(), *marks, *entries], clip.points)
         self.still = set(axes.get_children())
 
     def above(self) -> list[Artist]:
@@ -200,9 +185,11 @@ class _Panel:
         """Add what moves, as it is at one of the steps; returns legend entries for lights and events."""
         axes, segment, clip, step = self.axes, self.segment, self.clip, self.clip.start + at
         marks = draw_signals(axes, segment, step, self.view)
-        draw_playback(axes, segment, step, clip.others)
-        for rank, (agent, color) in enumerate(zip(clip.agents, colors_of(segment, clip.agents), strict=True)):
-            draw_ways(axes, clip, rank, color, width=1.4, until=at)
+        plots.draw_playback(axes, segment, step, clip.others)
+        for rank, (agent, color) in enumerate(
+            zip(clip.agents, plots.colors_of(segment, clip.agents), strict=True)
+        ):
+            plots.draw_ways(axes, clip, rank, color, width=1.4, until=at)
             here = clip.valid[:, rank, at]
             position, heading = clip.position[here, rank, at], clip.heading[here, rank, at]
             size = np.broadcast_to(segment.size[agent], (len(position), 3))
@@ -212,7 +199,7 @@ class _Panel:
         boxes = place(CORNERS, segment.position[seen, step], segment.heading[seen, step], segment.size[seen])
         style: dict[str, Any] = {"facecolors": "none", "edgecolors": INK, "linewidths": 0.7, "zorder": 11}
         axes.add_collection(PolyCollection(list(boxes), gid="log", **style), autolim=False)
-        marks += filter(None, (draw_events(axes, clip, *event, until=at) for event in EVENTS))
+        marks += filter(None, (plots.draw_events(axes, clip, *event, until=at) for event in plots.EVENTS))
         add_caption(axes, f"{step * segment.dt:.1f} s", right=True)
         return marks
 
@@ -258,13 +245,6 @@ def _write(frames: Sequence[NDArray[np.uint8]], path: Path, interval: float) -> 
     ]
     # The format counts in hundredths: rounded frame by frame, the error would grow.
     ends = np.rint(100 * interval * np.arange(len(images) + 1)).astype(int)
+    more: dict[str, Any] = {"save_all": True, "append_images": images[1:], "loop": 0, "optimize": True}
     with replacing(path) as draft:
-        images[0].save(
-            draft,
-            format="GIF",
-            save_all=True,
-            append_images=images[1:],
-            duration=(10 * np.diff(ends)).tolist(),
-            loop=0,
-            optimize=True,
-        )
+        images[0].save(draft, format="GIF", duration=(10 * np.diff(ends)).tolist(), **more)

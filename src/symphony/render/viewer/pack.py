@@ -28,11 +28,8 @@ if TYPE_CHECKING:
 _TYPES = {"i32": np.int32, "i16": np.int16, "u8": np.uint8, "f32": np.float32}
 DEFAULT_WIDTH, BIKE_WIDTH = 3.6, 1.6
 """Metres, for lanes whose width the source does not give."""
-MILLIMETRE = 1e-3
-ANGLE = 1e-4
-"""Radians that headings are rounded to."""
-CENTIMETRE = 1e-2
-"""Metres that sizes, and m/s that speeds are rounded to."""
+MILLIMETRE, CENTIMETRE, ANGLE = 1e-3, 1e-2, 1e-4
+"""What places (metres), sizes and speeds (metres, m/s) and headings (radians) are rounded to."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +95,8 @@ class _Packer:
         self.add(f"{name}.s", "i16", state[..., 3], CENTIMETRE)
 
     def text(self, facts: dict[str, Any]) -> str:
-        header = json.dumps(
-            {"facts": facts, "arrays": self.arrays}, ensure_ascii=False, allow_nan=False
-        ).encode()
+        told = {"facts": facts, "arrays": self.arrays}
+        header = json.dumps(told, ensure_ascii=False, allow_nan=False).encode()
         header += b" " * (-len(header) % 4)
         block = len(header).to_bytes(4, "little") + header + b"".join(self.data)
         return base64.b64encode(zlib.compress(block, 9)).decode()
@@ -162,9 +158,8 @@ def _pack_road(packer: _Packer, segment: RunSegment) -> None:
     road = segment.road
     default = np.where(road.lane_type == LaneType.BIKE_LANE, BIKE_WIDTH, DEFAULT_WIDTH)
     packer.lines("lanes", road.lanes)
-    packer.add(
-        "lanes.width", "i16", np.where(np.isnan(road.lane_width), default, road.lane_width), CENTIMETRE
-    )
+    width = np.where(np.isnan(road.lane_width), default, road.lane_width)
+    packer.add("lanes.width", "i16", width, CENTIMETRE)
     packer.lines("boundary", road.boundary)
     packer.lines("marks", road.marks)
     packer.add("marks.type", "u8", road.mark_type)
