@@ -7,7 +7,7 @@ import pytest
 
 from helpers_segments import crossing, straight_road
 from symphony.data.segment import AgentType, RunSegment, SignalState
-from symphony.rollouts.bystanders import AHEAD, COURSE, PACE, standing, walks
+from symphony.wosac.bystanders import AHEAD, COURSE, PACE, standing, walks
 from symphony.wosac.segments import wosac_window
 
 

@@ -33,8 +33,8 @@ from symphony.roadgraph import LaneGraph
 from symphony.rollouts.control import given_goals
 from symphony.rollouts.crowd import Crowd, CrowdDataset, crowd_dataset
 from symphony.rollouts.driving import simulation
+from symphony.saved.rollouts import world_of
 from symphony.saved.saving import save_simulation
-from symphony.saved.world import world_of
 
 DT = 0.2
 END = 200.0

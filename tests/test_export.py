@@ -18,8 +18,7 @@ from symphony.data.segment import AgentType, Polylines, RunSegment, SignalState
 from symphony.data.sources.commonroad import CommonRoadReader
 from symphony.saved.export import commonroad, to_dict
 from symphony.saved.folder import About, save_rollouts
-from symphony.saved.rollouts import SavedRollouts
-from symphony.saved.world import World, world_of
+from symphony.saved.rollouts import SavedRollouts, World, world_of
 
 
 def read_back(saved: SavedRollouts, rollout: int, path: Path) -> RunSegment:

@@ -22,7 +22,7 @@ from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import SymphonyError
 from symphony.evaluation import evaluate
-from symphony.rollouts.finite import NotFiniteError
+from symphony.rollouts.unroll import NotFiniteError
 
 LENGTHS = (7, 4, 8)
 """Steps of the segments ``straight-0``, ``crossing-1`` and ``crossing-2``."""

@@ -29,7 +29,7 @@ from symphony.envs.scene import PointType
 from symphony.envs.tables import Tables
 from symphony.evaluation import evaluate
 from symphony.geometry import LEVEL, levels_apart
-from symphony.saved.world import world_of
+from symphony.saved.rollouts import world_of
 
 HIGH = 6.0
 STEPS = 41

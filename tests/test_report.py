@@ -36,8 +36,7 @@ from symphony.geometry import box_gap
 from symphony.metrics import CollisionKind
 from symphony.rollouts.driving import playback
 from symphony.saved.folder import About, RolloutWriter, save_rollouts
-from symphony.saved.rollouts import SavedRollouts, saved_rollouts
-from symphony.saved.world import world_of
+from symphony.saved.rollouts import SavedRollouts, saved_rollouts, world_of
 
 ABOUT = About("made")
 DT = 0.2

@@ -23,15 +23,17 @@ from symphony.data.store import SegmentStore
 from symphony.errors import DataError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.saved.folder import (
+    KEY,
     About,
     RolloutFolder,
     RolloutWriter,
     load_rollouts,
+    read_tensors,
     save_rollouts,
+    tensors_of,
 )
 from symphony.saved.rollouts import SavedRollouts
 from symphony.saved.saving import save_simulation
-from symphony.saved.tensors import KEY, read_tensors, tensors_of
 
 ABOUT = About("made", 3, {"interactive": "made", "others": "playback"}, {"rollouts": 2}, {"checksum": "ab"})
 

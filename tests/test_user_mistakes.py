@@ -23,10 +23,10 @@ from symphony.data.store import SegmentStore
 from symphony.errors import DataError
 from symphony.evaluation.planners import check_crowds, winners
 from symphony.planners.calls import answer, plans_of
+from symphony.planners.identity import source_of
 from symphony.recipes import train
 from symphony.rollouts.crowd import crowd_dataset
 from symphony.saved.folder import load_rollouts
-from symphony.saved.identity import source_of
 from symphony.saved.saving import save_simulation
 
 PLAN = "def plan(seen):\n    return {}\n"

@@ -264,7 +264,8 @@ def test_the_browser_reads_the_numbers_and_reacts(tmp_path: Path) -> None:
     trees = tree.trees
     assert trees is not None
     assert out["periods"] == trees.parents.shape[1]
-    kept, went_on = trees.reaches_leaf[0, 0], trees.copies[0, 0] > 0
+    branches = np.arange(trees.parents.shape[-1])
+    kept, went_on = np.isin(branches, trees.slots[0, 0]), np.isin(branches, trees.parents[0, 0])
     fates = np.where(kept, "kept", np.where(went_on, "died out", "pruned"))
     assert out["fates"] == fates.tolist()
     assert out["history"] == trees.slots[0, np.arange(tree.steps) // trees.prune_every, 0].tolist()

@@ -29,7 +29,7 @@ from symphony.errors import ConfigError, SymphonyError
 from symphony.evaluation import Evaluation, evaluate
 from symphony.evaluation.pictures import ClipKeeper, RolloutKeeper
 from symphony.learning.demonstrations import SceneDataset
-from symphony.rollouts.finite import NotFiniteError
+from symphony.rollouts.unroll import NotFiniteError
 from symphony.rollouts.workers import batches, naming, segments_together, shared
 from symphony.saved.folder import About, RolloutWriter
 from symphony.saved.rollouts import SavedRollouts

@@ -21,8 +21,7 @@ from symphony.evaluation.contacts import contacts
 from symphony.evaluation.report import KIND_NAMES, Report, add_segment
 from symphony.metrics import CollisionKind, collision_kinds
 from symphony.rollouts.unroll import between_states
-from symphony.saved.rollouts import SavedRollouts
-from symphony.saved.world import world_of
+from symphony.saved.rollouts import SavedRollouts, world_of
 
 PHASES = 8
 KINDS = {name: kind for kind, name in KIND_NAMES.items()}

@@ -19,7 +19,7 @@ from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.evaluation.contacts import time_to_collision
 from symphony.geometry import levels_apart
-from symphony.saved.world import World
+from symphony.saved.rollouts import World
 
 LONGEST = 3.0
 """Seconds, of time to collision and of encroachment, above which nothing is critical."""

@@ -103,10 +103,9 @@ class Evaluate(shared.Simulation):
         if self.save_rollouts is not None:
             from symphony.evaluation.pictures import RolloutKeeper
             from symphony.saved.folder import About, RolloutWriter
-            from symphony.saved.identity import identity_of
             from symphony.saved.saving import plain_settings
 
-            plain = plain_settings(self.config, agent.interactive, agent.duration) | identity_of(agent)
+            plain = plain_settings(self.config, agent, agent.interactive, agent.duration)
             about = About.of(agent.name, store, plain, seed=self.config.seed)
             keepers["rollouts"] = RolloutKeeper(RolloutWriter(self.save_rollouts, about))
         return keepers

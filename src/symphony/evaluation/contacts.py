@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from symphony.geometry import boxes_overlap, levels_apart, meeting_time
 from symphony.metrics import meetings
 from symphony.metrics.kinds import kind_of_contact
-from symphony.saved.world import World
+from symphony.saved.rollouts import World
 
 Reals = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -20,8 +20,7 @@ from symphony.geometry.stations import stations_along
 from symphony.metrics.kinds import STANDING
 from symphony.roadgraph.lines import line_strings, turn_between
 from symphony.roadgraph.routes import ends_inside
-from symphony.saved.rollouts import SavedRollouts
-from symphony.saved.world import World
+from symphony.saved.rollouts import SavedRollouts, World
 
 RED = (SignalState.STOP, SignalState.ARROW_STOP)
 SAME_WAY = math.pi / 2

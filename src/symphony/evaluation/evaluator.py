@@ -29,7 +29,6 @@ from symphony.metrics import Choice, CollisionKinds, RolloutMetrics, choices, co
 from symphony.roadgraph import visited_curvatures
 from symphony.rollouts.crowd import crowd_dataset
 from symphony.rollouts.driving import Simulation, simulate_batch
-from symphony.rollouts.finite import NotFiniteError
 from symphony.rollouts.unroll import Rollouts, existing
 from symphony.rollouts.workers import batches, naming, segments_together, shared
 from symphony.saved.rollouts import SavedRollouts, saved_rollouts
@@ -204,10 +203,7 @@ class _BatchEvaluator:
             seen: list[SavedRollouts] = []
             for agent, blank in zip(self.agents, self.blank, strict=True):
                 began = time.process_time()
-                try:
-                    found = simulate_batch(agent, scenes, blank.config)
-                except NotFiniteError as error:
-                    raise error.named(self.dataset.segment(items[error.row]).segment_id) from error
+                found = simulate_batch(agent, scenes, blank.config)
                 seconds = time.process_time() - began
                 part = dataclasses.replace(
                     blank, metrics=RolloutMetrics(), own={}, seconds=seconds, steps=found.steps

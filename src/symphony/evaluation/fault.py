@@ -26,7 +26,7 @@ from symphony.geometry import pose_at
 from symphony.geometry.boxes import covers, relation
 from symphony.metrics import CollisionKind
 from symphony.metrics.kinds import STANDING
-from symphony.saved.world import World
+from symphony.saved.rollouts import World
 
 RED_SECONDS = 5.0
 """Seconds for which an agent that ran a red light answers for whom it meets across."""

@@ -34,8 +34,7 @@ from symphony.metrics import CollisionKind
 from symphony.metrics.intervals import ratio, zero_bound
 from symphony.render.viewer import Event
 from symphony.saved.folder import RolloutFolder
-from symphony.saved.rollouts import SavedRollouts
-from symphony.saved.world import world_of
+from symphony.saved.rollouts import SavedRollouts, world_of
 
 Evaluated = Literal["interactive", "ego"]
 Row = dict[str, Any]

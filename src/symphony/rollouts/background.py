@@ -1,7 +1,6 @@
 """Background traffic: vehicles that nobody evaluates, driven by a rule, all rollouts at a time.
 
-Legend: B scenes, N driven agents, K points of a route, P background agents that are there, in any rollout; on a
-device all agents.
+Legend: B scenes, N driven agents, K points of a route, P background agents that are there, in any rollout.
 """
 
 from __future__ import annotations
@@ -10,9 +9,9 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
@@ -26,17 +25,7 @@ from symphony.envs.scene import PointType, SceneBatch
 from symphony.geometry.frames import wrap
 from symphony.geometry.nearest import nearest, on_host
 from symphony.geometry.stations import NEAR
-from symphony.planners.included import (
-    AMBER,
-    AT_STOP,
-    BACK,
-    BEFORE,
-    BEYOND,
-    RED,
-    STOP_CHORD,
-    VIEW,
-    IDMPlanner,
-)
+from symphony.planners import included
 from symphony.planners.interface import MAX_BRAKING, MAX_STEERING
 
 _LEADERS = 16
@@ -45,41 +34,34 @@ _WITH = 0.25
 """Cosine of the largest angle between a vehicle and the part of its route that it is on."""
 
 
-class ConstantSpeed(TensorDictModuleBase):
+def constant_speed(env: DrivingEnv) -> TensorDictModule:
     """Background agents keep speed and heading."""
 
-    in_keys = [keys.STATE]  # noqa: RUF012 - the type TensorDictModuleBase declares
-    out_keys = [keys.BACKGROUND]  # noqa: RUF012
+    def onward(state: Float[Tensor, "*b N 4"]) -> Float[Tensor, "*b N 4"]:
+        return torch.cat(
+            [state[..., :2] + state[..., 3:] * env.dt * _unit(state[..., 2]), state[..., 2:]], -1
+        )
 
-    def __init__(self, env: DrivingEnv) -> None:
-        super().__init__()
-        self.env = env
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the next states [..., N, 4]."""
-        state = tensordict.get(keys.STATE)
-        way = torch.stack([state[..., 2].cos(), state[..., 2].sin()], -1)
-        moved = state[..., :2] + state[..., 3:] * self.env.dt * way
-        return tensordict.set(keys.BACKGROUND, torch.cat([moved, state[..., 2:]], -1))
+    return TensorDictModule(onward, [keys.STATE], [keys.BACKGROUND])
 
 
 class CarFollower(TensorDictModuleBase):
     """Background agents follow the routes of the log at the speed of the intelligent driver model.
 
-    What :class:`symphony.planners.included.IDMPlanner` does for one vehicle, with its parameters, for many at a
-    time: boxes of others are taken by their extent along and across the route, and only the nearest ones ahead are
+    It does what :class:`symphony.planners.included.IDMPlanner` does for one vehicle, with its parameters, for many at
+    a time: boxes of others are taken by their extent along and across the route, and only the nearest ones ahead are
     looked at. One without a route goes straight on.
 
     Args:
         env: whose scenes have routes.
     """
 
-    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID]  # noqa: RUF012
+    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID]  # noqa: RUF012 - the type the base declares
     out_keys = [keys.BACKGROUND]  # noqa: RUF012
 
     def __init__(self, env: DrivingEnv) -> None:
         super().__init__()
-        self.env, self.driver = env, IDMPlanner()
+        self.env, self.driver = env, included.IDMPlanner()
         self.routes = _routes(env.scenes, self.driver)
 
     @torch.no_grad()
@@ -89,27 +71,32 @@ class CarFollower(TensorDictModuleBase):
         row, at = tensordict.get(keys.SCENE).flatten(), tensordict.get(keys.STEP).flatten()
         state, valid = (tensordict.get(key).flatten(0, lead - 1) for key in (keys.STATE, keys.VALID))
         drives = scenes.background[row] & valid
-        # A device would wait to tell whom to leave out: there all others are moved, too, and put back.
-        m, n = drives.nonzero(as_tuple=True) if on_host(drives) else _pairs(drives)
+        if on_host(drives):
+            m, n = drives.nonzero(as_tuple=True)
+        else:  # a device would wait to tell whom to leave out: all others are moved, too, and put back
+            m, n = torch.cartesian_prod(*(torch.arange(k, device=row.device) for k in drives.shape)).unbind(
+                -1
+            )
         everyone = self.env.objects(row, at, state, valid)
-        size = scenes.box_size[row[m], scenes.interactive[row[m], n]]
-        own, line = state[m, n], _Lines(*(part[row[m], n] for part in self.routes))
-        station = _own_station(line, own, self._driven(row[m], at[m], n, own[:, 3]))
-        front = station + 0.5 * size[:, 0]
-        gap, speed = self._leader(line, everyone, m, scenes.interactive[row[m], n], own, size, station)
-        red = self._red(line, row[m], at[m], front, own[:, 3])
-        gap, speed = torch.minimum(gap, red), torch.where(red < gap, 0.0, speed)
-        pull = self._acceleration(own[:, 3], self._free_speed(line, station), gap, speed)
-        after = bicycle_step(
-            own, pull, self._steering(line, own, size[:, 0], station), size[:, 0], self.env.dt
+        agent = scenes.interactive[row[m], n]
+        own, size, line = (
+            state[m, n],
+            scenes.box_size[row[m], agent],
+            _Lines(*(r[row[m], n] for r in self.routes)),
         )
+        speed = own[:, 3]
+        station = _own_station(line, own, self._driven(row[m], at[m], n, speed))
+        gap, other = self._leader(line, everyone, m, agent, own, size, station)
+        red = self._red(line, row[m], at[m], station + 0.5 * size[:, 0], speed)
+        gap, other = torch.minimum(gap, red), torch.where(red < gap, 0.0, other)
+        pull = self._acceleration(speed, self._free_speed(line, station), gap, other)
+        after = bicycle_step(own, pull, _steering(line, own, size[:, 0], station), size[:, 0], self.env.dt)
         moved = state.index_put((m, n), torch.where(drives[m, n, None], after, own))
         return tensordict.set(keys.BACKGROUND, moved.reshape(tensordict.get(keys.STATE).shape))
 
     def _driven(self, row: Tensor, at: Tensor, n: Tensor, speed: Tensor) -> Float[Tensor, " P"]:
-        """About how far agents have come since they entered: by the mean of their speeds then and now."""
-        scenes = self.env.scenes
-        enter = scenes.enter[row, n]
+        """About how far agents have come since they entered, by the mean of their speeds then and now."""
+        scenes, enter = self.env.scenes, self.env.scenes.enter[row, n]
         before = scenes.log_state[row, enter, scenes.interactive[row, n], 3:].norm(dim=-1)
         return (at - enter).clamp_min(0) * self.env.dt * 0.5 * (before + speed)
 
@@ -122,34 +109,26 @@ class CarFollower(TensorDictModuleBase):
 
     def _free_speed(self, line: _Lines, station: Tensor) -> Float[Tensor, " P"]:
         away = line.arc - station[:, None]
-        ahead = (away > -SPACING) & (away < VIEW)
+        ahead = (away > -SPACING) & (away < included.VIEW)
         allowed = (line.limit.square() + 2.0 * self.driver.braking * away.clamp_min(0.0)).sqrt()
         free = torch.where(ahead, allowed, torch.inf).amin(-1)
         return torch.where(ahead.any(-1), free, self.driver.speed)
 
     def _leader(
-        self,
-        line: _Lines,
-        everyone: Objects,
-        m: Int[Tensor, " P"],
-        agent: Int[Tensor, " P"],
-        own: Float[Tensor, "P 4"],
-        size: Float[Tensor, "P 2"],
-        station: Float[Tensor, " P"],
+        self, line: _Lines, now: Objects, m: Tensor, agent: Tensor, own: Tensor, size: Tensor, station: Tensor
     ) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
         """Gap to what is next in front, infinite for nothing, and its speed along the route."""
-        delta = everyone.state[m, :, :2] - own[:, None, :2]
+        delta = now.state[m, :, :2] - own[:, None, :2]
         squared = delta.square().sum(-1)
-        forward = torch.stack([own[:, 2].cos(), own[:, 2].sin()], -1)
         # Behind is what is behind on any bend that a vehicle can take within its own length.
-        behind = (delta * forward[:, None]).sum(-1) < -size[:, :1]
+        behind = (delta * _unit(own[:, 2])[:, None]).sum(-1) < -size[:, :1]
         other = torch.arange(squared.shape[1], device=m.device) != agent[:, None]
-        hidden = ~everyone.valid[m] | ~other | behind | (squared > VIEW**2)
-        chosen, there = nearest(squared.masked_fill(hidden, torch.inf)[:, None], _LEADERS)
-        chosen, there = chosen[:, 0], there[:, 0]
-        pick = (m[:, None], chosen)
-        pose, box = everyone.state[pick], everyone.size[pick]
-        along, aside, way = _project(line, pose[..., :2], _within(line, station - size[:, 0], VIEW))
+        hidden = ~now.valid[m] | ~other | behind | (squared > included.VIEW**2)
+        chosen, there = (
+            part[:, 0] for part in nearest(squared.masked_fill(hidden, torch.inf)[:, None], _LEADERS)
+        )
+        pose, box = now.state[m[:, None], chosen], now.size[m[:, None], chosen]
+        along, aside, way = _project(line, pose[..., :2], _within(line, station - size[:, 0], included.VIEW))
         turn = pose[..., 2] - way
         cos, sin = turn.cos().abs(), turn.sin().abs()
         reach = 0.5 * (cos * box[..., 0] + sin * box[..., 1])
@@ -169,46 +148,28 @@ class CarFollower(TensorDictModuleBase):
         shown = scenes.light[row, at.clamp(max=scenes.light.shape[1] - 1)]
         gap = line.stop - front[:, None]
         in_time = gap > (speed.square() / (2.0 * self.driver.braking))[:, None]
-        stops = _among(shown, RED) | (_among(shown, AMBER) & in_time)
-        gap = torch.where(stops & (gap > -2.0), gap, torch.inf)
-        return torch.cat([gap, torch.full_like(gap[:, :0].sum(-1, keepdim=True), torch.inf)], -1).amin(-1)
-
-    def _steering(self, line: _Lines, own: Tensor, length: Tensor, station: Tensor) -> Float[Tensor, " P"]:
-        base, (x, y, heading, speed) = WHEELBASE * length, own.unbind(-1)
-        rear = torch.stack([x - 0.5 * base * heading.cos(), y - 0.5 * base * heading.sin()], -1)
-        ahead = (3.0 + 0.5 * speed.abs()).clamp_max(20.0)
-        near = _within(line, station - base - BACK, base + 2 * BACK)
-        to = _at(line, _project(line, rear[:, None], near)[0][:, 0] + ahead) - rear
-        angle = torch.atan2(to[:, 1], to[:, 0]) - heading
-        found = torch.atan(2.0 * base * angle.sin() / to.norm(dim=-1).clamp_min(0.1))
-        return found.clamp(-MAX_STEERING, MAX_STEERING)
+        stops = _among(shown, included.RED) | (_among(shown, included.AMBER) & in_time)
+        return pad(torch.where(stops & (gap > -2.0), gap, torch.inf), (0, 1), value=torch.inf).amin(-1)
 
 
 class _Lines(NamedTuple):
-    """Routes, straight on past both of their ends; leading dimensions [B, N] or [P].
-
-    Attributes:
-        points: [..., K + 2, 2].
-        arc: [..., K + 2] metres, 0 at the first point of the route.
-        limit: [..., K + 2] m/s that its lanes and its bends allow.
-        stop: [..., Q] where the front stops at a light, infinite for those of other ways.
+    """Routes [B, N] or [P], straight on past both of their ends: points; metres along, 0 at the first point of the
+    route; m/s that lanes and bends allow; metres at which lights stop the front, infinite for those of other ways.
     """
 
-    points: Tensor
-    arc: Tensor
-    limit: Tensor
-    stop: Tensor
+    points: Float[Tensor, "*b K+2 2"]
+    arc: Float[Tensor, "*b K+2"]
+    limit: Float[Tensor, "*b K+2"]
+    stop: Float[Tensor, "*b Q"]
 
 
-def _routes(scenes: SceneBatch, driver: IDMPlanner) -> _Lines:
-    """The routes of the log of all agents [B, N]; without one, straight on."""
+def _routes(scenes: SceneBatch, driver: included.IDMPlanner) -> _Lines:
+    """The routes of the log of all agents [B, N]; without one, straight on from where an agent enters."""
     row = torch.arange(len(scenes), device=scenes.route_point.device)
     points, exist = scenes.routes.of(row, scenes.route_logged).lines()
-    # Of an agent without a route: two points from where it enters.
     enters = scenes.log_state[row[:, None], scenes.enter, scenes.interactive]
     place = torch.arange(points.shape[2], device=row.device)
-    way = torch.stack([enters[..., 2].cos(), enters[..., 2].sin()], -1)
-    straight = enters[..., None, :2] + SPACING * place[:, None] * way[..., None, :]
+    straight = enters[..., None, :2] + SPACING * place[:, None] * _unit(enters[..., 2])[..., None, :]
     points = torch.where((exist > 1)[..., None, None], points, straight)
     last = torch.where(exist > 1, exist, points.shape[2])[..., None] - 1
     ends = [points.gather(2, k[..., None].expand(*k.shape, 2))[:, :, 0] for k in (last - 1, last)]
@@ -216,23 +177,15 @@ def _routes(scenes: SceneBatch, driver: IDMPlanner) -> _Lines:
     past = (place - last).clamp_min(0)[..., None]
     points = torch.where(past > 0, ends[1][:, :, None] + SPACING * past * onward[:, :, None], points)
     first = normalize(points[:, :, 1] - points[:, :, 0], dim=-1, eps=1e-6)
-    points = torch.cat(
-        [
-            (points[:, :, 0] - BEFORE * first)[:, :, None],
-            points,
-            (points[:, :, -1] + BEYOND * onward)[:, :, None],
-        ],
-        2,
-    )
+    before, beyond = points[:, :, 0] - included.BEFORE * first, points[:, :, -1] + included.BEYOND * onward
+    points = torch.cat([before[:, :, None], points, beyond[:, :, None]], 2)
     pieces = points.diff(dim=2)
     length = pieces.norm(dim=-1)
-    arc = torch.cat([torch.zeros_like(length[..., :1]), length.cumsum(-1)], -1) - BEFORE
-    angle = torch.atan2(pieces[..., 1], pieces[..., 0])
-    near = length.clamp_max(SPACING)
+    arc = pad(length.cumsum(-1), (1, 0)) - included.BEFORE
+    angle, near = torch.atan2(pieces[..., 1], pieces[..., 0]), length.clamp_max(SPACING)
     bend = wrap(angle.diff(dim=-1)).abs() / (0.5 * (near[..., 1:] + near[..., :-1])).clamp_min(1e-3)
-    bend = pad(bend, (1, 1))
-    limit = _limits(scenes, points, driver.speed)
-    limit = torch.minimum(limit, (driver.lateral / bend.clamp_min(1e-6)).sqrt())
+    bends = (driver.lateral / pad(bend, (1, 1)).clamp_min(1e-6)).sqrt()
+    limit = torch.minimum(_limits(scenes, points, driver.speed), bends)
     lines = _Lines(points, arc, limit, arc[..., :0])
     return lines._replace(stop=_stops(scenes, lines))
 
@@ -240,16 +193,13 @@ def _routes(scenes: SceneBatch, driver: IDMPlanner) -> _Lines:
 def _limits(scenes: SceneBatch, points: Tensor, unknown: float) -> Float[Tensor, "B N K"]:
     """Speed limit of the lane nearest to each point."""
     lane = scenes.point_valid & (scenes.point_type == PointType.LANE)
-    found = []
+    found = torch.full_like(points[..., 0], unknown)
     for b in range(len(scenes)):
         lanes, speed = scenes.point[b, lane[b]], scenes.point_speed[b, lane[b]]
-        if not len(lanes):
-            found.append(torch.full_like(points[b, ..., 0], unknown))
-            continue
-        nearest_lane = torch.cdist(points[b].flatten(0, 1), lanes).argmin(-1)
-        limit = speed[nearest_lane].reshape(points.shape[1:3])
-        found.append(torch.where(limit > 0, limit, unknown))
-    return torch.stack(found)
+        if len(lanes):
+            limit = speed[torch.cdist(points[b].flatten(0, 1), lanes).argmin(-1)].reshape(points.shape[1:3])
+            found[b] = torch.where(limit > 0, limit, unknown)
+    return found
 
 
 def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
@@ -258,8 +208,7 @@ def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
     A light is on a route if its stop point is; of several with one stop point, that whose lane leads most nearly to
     where the route goes.
     """
-    lights = scenes.light.shape[2]
-    out = torch.full((*lines.arc.shape[:2], lights), torch.inf, device=lines.arc.device)
+    out = torch.full((*lines.arc.shape[:2], scenes.light.shape[2]), torch.inf, device=lines.arc.device)
     for b in range(len(scenes)):
         which = (scenes.point_light[b] >= 0).nonzero()[:, 0]
         if not len(which):
@@ -267,9 +216,9 @@ def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
         point, way = scenes.point[b, which], scenes.point_direction[b, which]
         line = _Lines(*(part[b] for part in lines))
         station, aside, _ = _project(line, point.expand(len(line.arc), -1, -1))
-        beyond = torch.stack([_at(line, station[:, q] + STOP_CHORD) for q in range(len(which))], 1)
+        beyond = torch.stack([_at(line, column + included.STOP_CHORD) for column in station.unbind(1)], 1)
         along = (normalize(beyond - point, dim=-1, eps=1e-6) * way).sum(-1)
-        along = along.masked_fill((aside.abs() > AT_STOP) | (station < -5.0), -torch.inf)
+        along = along.masked_fill((aside.abs() > included.AT_STOP) | (station < -5.0), -torch.inf)
         same = (point[:, None] - point[None]).norm(dim=-1) < 1.0
         best = torch.where(same, along[:, None, :], -torch.inf).amax(-1)
         mine = (along > 0.0) & (along >= best)
@@ -282,10 +231,20 @@ def _own_station(line: _Lines, own: Float[Tensor, "P 4"], driven: Float[Tensor, 
     fits the way driven best, as routes lead around blocks.
     """
     way = line.points.diff(dim=1)
-    heading = torch.stack([own[:, 2].cos(), own[:, 2].sin()], -1)
-    with_it = (way * heading[:, None]).sum(-1) > _WITH * way.norm(dim=-1)
+    with_it = (way * _unit(own[:, 2])[:, None]).sum(-1) > _WITH * way.norm(dim=-1)
     with_it = with_it | ~with_it.any(-1, keepdim=True)
     return _project(line, own[:, None, :2], with_it, driven)[0][:, 0]
+
+
+def _steering(line: _Lines, own: Tensor, length: Tensor, station: Tensor) -> Float[Tensor, " P"]:
+    base, (x, y, heading, speed) = WHEELBASE * length, own.unbind(-1)
+    rear = torch.stack([x - 0.5 * base * heading.cos(), y - 0.5 * base * heading.sin()], -1)
+    ahead = (3.0 + 0.5 * speed.abs()).clamp_max(20.0)
+    near = _within(line, station - base - included.BACK, base + 2 * included.BACK)
+    to = _at(line, _project(line, rear[:, None], near)[0][:, 0] + ahead) - rear
+    angle = torch.atan2(to[:, 1], to[:, 0]) - heading
+    found = torch.atan(2.0 * base * angle.sin() / to.norm(dim=-1).clamp_min(0.1))
+    return found.clamp(-MAX_STEERING, MAX_STEERING)
 
 
 def _within(line: _Lines, low: Float[Tensor, " P"], length: Tensor | float) -> Bool[Tensor, "P pieces"]:
@@ -322,32 +281,22 @@ def _project(
     def of(values: Tensor) -> Tensor:
         return values.expand_as(squared).gather(-1, which)[..., 0]
 
-    cos, sin = of(cos), of(sin)
+    cos, sin, away = of(cos), of(sin), of(distance)
     left = cos * of(y) - sin * of(x)
-    away = of(squared).sqrt()
     return of(line.arc[:, None, :-1]) + of(share), torch.where(left < 0, -away, away), torch.atan2(sin, cos)
 
 
 def _at(line: _Lines, station: Float[Tensor, " P"]) -> Float[Tensor, "P 2"]:
     """The points so many metres along."""
     piece = (torch.searchsorted(line.arc.contiguous(), station[:, None], right=True) - 1)[:, 0]
-    piece = piece.clamp(0, line.arc.shape[-1] - 2)
-    row = torch.arange(len(piece), device=piece.device)
-    start, end = line.points[row, piece], line.points[row, piece + 1]
-    share = (station - line.arc[row, piece]) / (line.arc[row, piece + 1] - line.arc[row, piece]).clamp_min(
-        1e-6
-    )
-    return start + share[:, None] * (end - start)
+    piece, row = piece.clamp(0, line.arc.shape[-1] - 2), torch.arange(len(piece), device=piece.device)
+    (start, end), (low, high) = ((part[row, piece], part[row, piece + 1]) for part in (line.points, line.arc))
+    return start + ((station - low) / (high - low).clamp_min(1e-6))[:, None] * (end - start)
 
 
-def _pairs(values: Tensor) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
-    """Row and column of every element of a matrix."""
-    row, column = (torch.arange(size, device=values.device) for size in values.shape)
-    return row.repeat_interleave(len(column)), column.repeat(len(row))
+def _unit(heading: Tensor) -> Tensor:
+    return torch.stack([heading.cos(), heading.sin()], -1)
 
 
 def _among(shown: Tensor, states: tuple[SignalState, ...]) -> Tensor:
-    found = torch.zeros_like(shown, dtype=torch.bool)
-    for state in states:
-        found |= shown == int(state)
-    return found
+    return torch.stack([shown == int(state) for state in states]).any(0)

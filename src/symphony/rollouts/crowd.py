@@ -20,7 +20,6 @@ from symphony.config.evaluation import MOST, TOGETHER
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import MOVING, interactive_choice, travel
 from symphony.data.store import SegmentStore
-from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.edge import beyond, map_edge
 from symphony.envs.routes import route_table
 from symphony.envs.scene import SceneBatch, scene
@@ -36,15 +35,10 @@ PAIR = 2
 
 @dataclass(frozen=True)
 class Crowd:
-    """Which agents of a segment are driven.
-
-    Attributes:
-        count: by the agent, at most.
-        everyone: not only those that move: also vehicles that stand in a lane.
-        radius: metres from the ego within which those beyond :data:`PAIR` must come in the log; 0 for no limit.
-        open_traffic: whether they enter and leave.
-        background: whether the other vehicles are driven, too, by a rule; up to :data:`MOST` with the others.
-        along_routes: whether that rule needs a route; vehicles that are on no lane then play back the log.
+    """Which agents of a segment are driven: so many by the agent at most, those that move, or everyone who moves or
+    stands in a lane. Those beyond :data:`PAIR` must come within a radius of the ego in the log (metres; 0 for no
+    limit). In open traffic they enter and leave. Where there is a background, the other vehicles are driven, too, by
+    a rule, up to :data:`MOST` with these; along routes, vehicles that are on no lane play back the log.
     """
 
     count: int
@@ -53,19 +47,6 @@ class Crowd:
     open_traffic: bool = False
     background: bool = False
     along_routes: bool = False
-
-    @classmethod
-    def of(cls, config: EvaluateConfig, default: int) -> Crowd:
-        """As an evaluation asks for it, ``default`` agents if it leaves that to the agent."""
-        everyone, rule = config.interactive == "all", config.others != "log"
-        return cls(
-            count=MOST if config.interactive == "all" else config.interactive or default,
-            everyone=everyone,
-            radius=config.radius,
-            open_traffic=config.open_traffic or everyone or rule,
-            background=rule,
-            along_routes=config.others == "idm",
-        )
 
     def choose(self, segment: RunSegment, graph: LaneGraph) -> tuple[Indices, Indices]:
         """Rows of A: those that the agent drives, the ego first, and background agents.
@@ -87,24 +68,27 @@ class Crowd:
         order = [*early[:PAIR], *early[PAIR:][self._near(segment, early[PAIR:])]]
         if len(order) >= self.count and not self.background:
             return np.array(order[: self.count], np.int64), np.zeros(0, np.int64)
-        moves = (segment.agent_type == AgentType.VEHICLE) & there.any(1) & (travel(segment) > MOVING)
-        stands = (segment.agent_type == AgentType.VEHICLE) & there.any(1) & ~moves & _in_lane(segment, graph)
+        vehicle, moves = (segment.agent_type == AgentType.VEHICLE) & there.any(1), travel(segment) > MOVING
+        stands = vehicle & ~moves & _in_lane(segment, graph)
         first = there.argmax(1)
-        away = _distance_at(segment, first)
-        rest = np.setdiff1d(np.flatnonzero(moves | stands), early)
-        rest = rest[np.lexsort((away[rest], stands[rest], first[rest]))]
+        rest = np.setdiff1d(np.flatnonzero((vehicle & moves) | stands), early)
+        rest = rest[np.lexsort((_distance_at(segment, first)[rest], stands[rest], first[rest]))]
         if not self.open_traffic:
             rest = rest[(first[rest] == 0) & stands[rest]]
         rest = rest[self._near(segment, rest)]
-        wanted = rest if self.everyone else rest[moves[rest]]
-        driven = np.array([*order, *wanted], np.int64)[: self.count]
+        driven = np.array([*order, *(rest if self.everyone else rest[moves[rest]])], np.int64)[: self.count]
         if not self.background:
             return driven, np.zeros(0, np.int64)
-        others = np.array([a for a in (*order, *rest) if a not in driven], np.int64)
-        if self.along_routes:
-            on_route = [route_table(segment, graph, int(a), int(first[a])).logged >= 0 for a in others]
-            others = others[np.array(on_route, bool)]
-        return driven, others[: MOST - len(driven)]
+        others = [
+            agent
+            for agent in (*order, *rest)
+            if agent not in driven
+            and (
+                not self.along_routes
+                or route_table(segment, graph, int(agent), int(first[agent])).logged >= 0
+            )
+        ]
+        return driven, np.array(others[: MOST - len(driven)], np.int64)
 
     def _near(self, segment: RunSegment, rows: Indices) -> NDArray[np.bool_]:
         """[K] whether agents come near the ego's log at some step that has both."""
@@ -116,31 +100,14 @@ class Crowd:
 
 
 class CrowdDataset(SceneDataset):
-    """Scenes in which a :class:`Crowd` is driven, whatever number that is in each.
-
-    Args:
-        store: the run segments.
-        crowd: which of their agents.
-        dynamics: as of :class:`SceneDataset`, like the others.
-        indices: see there.
-        routes: see there.
-        duration: see there.
-        keep: see there.
+    """Scenes in which a :class:`Crowd` is driven, whatever number that is in each; other arguments are those of
+    :class:`SceneDataset`.
     """
 
     def __init__(
-        self,
-        store: SegmentStore,
-        crowd: Crowd,
-        dynamics: Bicycle | Displacement | None = None,
-        indices: Sequence[int] | None = None,
-        *,
-        routes: bool = False,
-        duration: float = 0,
-        keep: int | None = None,
+        self, store: SegmentStore, crowd: Crowd, *given: Any, routes: bool = False, **named: Any
     ) -> None:
-        routes = routes or crowd.along_routes
-        super().__init__(store, crowd.count, dynamics, indices, routes=routes, duration=duration, keep=keep)
+        super().__init__(store, crowd.count, *given, routes=routes or crowd.along_routes, **named)
         self.crowd = crowd
 
     @property
@@ -174,31 +141,19 @@ def crowd_dataset(
     default: int | None = None,
     routes: bool = False,
 ) -> CrowdDataset:
-    """The scenes that a configuration asks for.
-
-    Args:
-        store: the run segments.
-        agent: that drives.
-        config: how many, how long.
-        indices: rows of the store; all by default.
-        default: interactive agents where the configuration leaves that open; by default as many as it was trained
-            with.
-        routes: whether scenes come with routes even if the agent follows none.
-
-    Warns:
-        DataWarning: if the store's generation is not finished.
+    """The scenes that a configuration asks for, of all or some rows of a store; a :class:`DataWarning` if its
+    generation is not finished. Where the configuration leaves that open, there are ``default`` interactive agents, or
+    as many as the agent was trained with; ``routes``: also for an agent that follows none.
     """
     if store.unfinished is not None:
         warnings.warn(f"{store.path} {store.unfinished}", DataWarning, stacklevel=2)
-    return CrowdDataset(
-        store,
-        Crowd.of(config, agent.interactive if default is None else default),
-        agent.dynamics,
-        indices,
-        routes=agent.routed or routes,
-        duration=config.duration or agent.duration,
-        keep=config.batch or TOGETHER,
-    )
+    everyone, rule = config.interactive == "all", config.others != "log"
+    count = MOST if config.interactive == "all" else config.interactive or default or agent.interactive
+    in_open = config.open_traffic or everyone or rule
+    crowd = Crowd(count, everyone, config.radius, in_open, rule, along_routes=config.others == "idm")
+    seconds, keep = config.duration or agent.duration, config.batch or TOGETHER
+    routes = agent.routed or routes
+    return CrowdDataset(store, crowd, agent.dynamics, indices, routes=routes, duration=seconds, keep=keep)
 
 
 def _in_lane(segment: RunSegment, graph: LaneGraph) -> NDArray[np.bool_]:
@@ -211,7 +166,5 @@ def _in_lane(segment: RunSegment, graph: LaneGraph) -> NDArray[np.bool_]:
 def _distance_at(segment: RunSegment, step: Indices) -> NDArray[np.floating[Any]]:
     """[A] metres from the ego at a step of each; from where it was last, if it is not seen then."""
     last = np.maximum.accumulate(np.where(segment.valid[segment.ego], np.arange(segment.num_steps), 0))[step]
-    everyone = np.arange(segment.num_agents)
-    return np.linalg.norm(
-        segment.position[everyone, step, :2] - segment.position[segment.ego, last, :2], axis=-1
-    )
+    own = segment.position[np.arange(segment.num_agents), step, :2]
+    return np.linalg.norm(own - segment.position[segment.ego, last, :2], axis=-1)

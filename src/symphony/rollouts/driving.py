@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,6 +15,7 @@ from symphony import keys
 from symphony.agents import Agent
 from symphony.collectors import Backtrack, BeamSearchResult, KeepAll, PruningRule, max_then_sum
 from symphony.config import EvaluateConfig
+from symphony.config.evaluation import Search
 from symphony.envs.baselines import ConstantVelocity
 from symphony.envs.dynamics import Bicycle
 from symphony.envs.flags import offroad_flags
@@ -25,11 +25,11 @@ from symphony.learning.experts import logged, logged_heights
 from symphony.metrics import collisions
 from symphony.modules import SeededNoise
 from symphony.planners.driver import EgoPlanners, EgoPolicy, PlannedEnv, RuledEgo, ego_policy
-from symphony.rollouts.background import CarFollower, ConstantSpeed
-from symphony.rollouts.control import Tempered, given_personas
-from symphony.rollouts.finite import NaNGuard
+from symphony.rollouts.background import CarFollower, constant_speed
+from symphony.rollouts.control import given_personas, tempered
 from symphony.rollouts.search import going_back, pruning_rule, search
 from symphony.rollouts.unroll import (
+    NaNGuard,
     Rollouts,
     between_states,
     draw_goals,
@@ -39,10 +39,7 @@ from symphony.rollouts.unroll import (
     start_states,
 )
 
-RULES: dict[str, Callable[[PlannedEnv], TensorDictModuleBase]] = {
-    "constant_velocity": ConstantSpeed,
-    "idm": CarFollower,
-}
+RULES: dict[str, Any] = {"constant_velocity": constant_speed, "idm": CarFollower}
 """Rules that can drive background agents in place of the agent, or everyone (an agent's ``rule``)."""
 
 
@@ -53,9 +50,9 @@ class Simulation(NamedTuple):
         rollouts: [B, K, ...].
         goal: [B, K, N] number of the route that each agent followed, -1 for none.
         search: the trees of which the rollouts are the leaves, [B, trees]; None without any.
+        at_states: [B, K, T, N] collisions at states only, as the paper and WOSAC count them.
         steps: that were simulated for them, each of a rollout or branch.
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
-        at_states: [B, K, T, N] collisions at states only, as the paper and WOSAC count them.
         drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
     """
 
@@ -77,41 +74,41 @@ def simulation(
     egos: EgoPlanners | None = None,
     given: Int[Tensor, "B N"] | None = None,
 ) -> Simulation:
-    """K rollouts of every scene, and how they came about.
+    """K rollouts of every scene, and how they came about: of a search with the pruned branches, if asked for.
 
-    Args:
-        agent: that drives.
-        scenes: B scenes.
-        config: how.
-        keep_tree: of a search keep the pruned branches, too.
-        egos: plan the first agent of every scene, which no search scores; the agent drives the others.
-        given: number of the route that an agent is to follow, -1 where that is left open.
+    ``egos`` plan the first agent of every scene, which no search scores; the agent drives the others. ``given`` are
+    the numbers of the routes that agents are to follow, -1 where that is left open.
 
     Raises:
         ConfigError: if the search needs a discriminator and the agent has none, the agent learned another time
-            step, a goal is given to an agent that follows none, a planner can't be copied for a search, or another
-            rule drives the others than the agent.
+            step or has no goals or discrete actions that could be changed, a planner can't be copied for a search, or
+            another rule drives the others than the agent.
         NotFiniteError: if one of its networks puts out a number that is not finite.
     """
     _check_given(agent, scenes, config, given)
-    if agent.rule:
-        scenes, config = _ruled(agent, scenes, config, given)
-    policy = _placeholder(scenes) if agent.policy is None else agent.policy
+    scenes, config = _ruled(agent, scenes, config, given) if agent.rule else (scenes, config)
+    # Beside log playback there is the ego of a planner alone: a policy whose actions nobody looks at will do.
+    policy = ConstantVelocity(Bicycle()) if agent.policy is None else agent.policy
+    if agent.policy is None and int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > 1:
+        raise ConfigError("beside log playback the planner's ego is the only interactive agent")
     agent.check_step(float(scenes.dt[0]))
     env = PlannedEnv(scenes, agent.dynamics, agent.observation)
     kind, trees, branches, taken, settings = agent.plan(config)
     searches = kind not in ("none", "log")
-    guards = [NaNGuard(env, policy, [keys.LOGITS, keys.ACTION], "policy")]
-    actor = acting(guards[0], env, config)
-    goals: NaNGuard | None = None
-    scorer: NaNGuard | None = None
-    if agent.goals is not None:
-        goals = NaNGuard(env, agent.goals, [keys.GOAL_LOGITS], "goal policy")
-        guards.insert(0, goals)
-    if agent.discriminator is not None and searches:
-        scorer = NaNGuard(env, agent.discriminator, [keys.SCORE], "discriminator", scores=True)
-        guards.append(scorer)
-    fix = _fixed_goals(scenes, given, along_log=config.others == "idm", ego=egos is not None)
+    guard = NaNGuard(env, policy, [keys.LOGITS, keys.ACTION], "policy")
+    goals = None if agent.goals is None else NaNGuard(env, agent.goals, [keys.GOAL_LOGITS], "goal policy")
+    asked = agent.discriminator if searches else None
+    scorer = None if asked is None else NaNGuard(env, asked, [keys.SCORE], "discriminator", scores=True)
+
+    def fixed(scene: Tensor, goal: Tensor) -> Tensor:
+        return _fixed(scenes, scene, goal, given, along_log=config.others == "idm", ego=egos is not None)
+
+    def renewed(state: TensorDictBase) -> TensorDictBase:
+        if goals is None or config.logged_goals:
+            return state
+        goal = draw_goals(env, goals, state, config.seed, state.get(keys.STREAM).squeeze(-1))
+        return env.with_goals(state, fixed(state.get(keys.SCENE).squeeze(-1), goal))
+
     start = start_states(
         env,
         goals,
@@ -121,31 +118,25 @@ def simulation(
         logged_goals=config.logged_goals,
         goals_per=settings.goals,
         personas=given_personas(agent.personas, config.persona),
-        fix=fix,
+        fix=fixed,
     )
-    planned: EgoPolicy | RuledEgo | None = None
-    result: BeamSearchResult | None = None
+    planned = None
+    actor = _acting(guard, env, config)
+    if egos is not None and kind == "backtrack":
+        raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
     if egos is not None:
-        if kind == "backtrack":
-            raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
         planned = ego_policy(env, egos, start, config.seed, RULES, forked=searches)
         actor = TensorDictSequential(actor, planned)
+    # The rollouts [B, trees, taken] that count, of all branches.
+    chosen, tree = torch.arange(taken, device=env.device).expand(len(scenes), trees, -1), None
     if not searches:
         noise = SeededNoise(config.seed, env.dynamics.numbers)
         found = simulate(env, TensorDictSequential(noise, actor), start)
-        steps, ends = start.numel() * env.decisions, start
+        steps, ends, goal = start.numel() * env.decisions, start, start.get(keys.GOAL)
     else:
-
-        def renewed(state: TensorDictBase) -> TensorDictBase:
-            if goals is None or config.logged_goals:
-                return state
-            goal = draw_goals(env, goals, state, config.seed, state.get(keys.STREAM).squeeze(-1))
-            return env.with_goals(state, fix(state.get(keys.SCENE).squeeze(-1), goal))
-
-        rules: dict[str, Callable[[], PruningRule | Backtrack]] = {
-            "best": KeepAll,
-            "backtrack": lambda: going_back(env, settings.threshold, start.numel(), renewed),
-        }
+        rule: PruningRule | Backtrack = KeepAll() if kind == "best" else pruning_rule(settings)
+        if kind == "backtrack":
+            rule = going_back(env, settings.threshold, start.numel(), renewed)
         with torch.no_grad():
             result = search(
                 env,
@@ -153,85 +144,65 @@ def simulation(
                 scorer,
                 start,
                 seed=config.seed,
-                rule=rules.get(kind, lambda: pruning_rule(settings))(),
+                rule=rule,
                 prune_every=settings.prune_every,
                 score=settings.score,
-                leaves=None if kind == "best" else taken,
-                keep_tree=keep_tree and kind == "tree",
                 ego=planned is None,
                 also=() if planned is None else (keys.PLANNER,),
+                leaves=None if kind == "best" else taken,
+                keep_tree=keep_tree and kind == "tree",
             )
         found, steps = rollouts_of(env, start, result.trajectories), result.simulated_steps
         ends = result.trajectories[..., -1]  # a copy of a branch follows the goals of its parent
-    for guard in guards:
-        guard.check()
-    # The rollouts [B, trees, taken] that count, of all branches.
-    chosen = torch.arange(taken, device=env.device).expand(len(scenes), trees, -1)
-    if kind == "best" and result is not None:
-        chosen = max_then_sum(result.scores, result.alive[..., None]).argsort(dim=-1, stable=True)[..., :1]
-    goal = ends.get(keys.GOAL)
-    if kind == "backtrack" and result is not None:
-        # Lines are trees of one branch each; to be filled from each other they are the branches of one.
-        begun = result.alive.squeeze(-2)[..., :: result.prune_every]
-        totals = torch.where(begun, result.totals.squeeze(-1), -torch.inf)  # what follows an end is never bad
-        chosen = filled_lines(totals, settings.threshold)[:, None]
-        found, goal = Rollouts(*(part.transpose(1, 2) for part in found)), goal.transpose(1, 2)
+        goal = ends.get(keys.GOAL)
+        if kind == "best":
+            chosen = max_then_sum(result.scores, result.alive[..., None]).argsort(dim=-1, stable=True)[
+                ..., :1
+            ]
+        elif kind == "tree":
+            tree = result
+        else:  # lines are trees of one branch each; to be filled from each other they are the branches of one
+            begun = result.alive.squeeze(-2)[..., :: result.prune_every]
+            totals = torch.where(
+                begun, result.totals.squeeze(-1), -torch.inf
+            )  # what follows an end is never bad
+            chosen = filled_lines(totals, settings.threshold)[:, None]
+            found, goal = Rollouts(*(part.transpose(1, 2) for part in found)), goal.transpose(1, 2)
+    for network in (goals, guard, scorer):
+        if network is not None:
+            network.check()
     rollouts = Rollouts(*(_branches(part, chosen).flatten(1, 2) for part in found))
-    goal = _branches(goal, chosen).flatten(1, 2)
-    tree = result if kind == "tree" else None
     drawn = None if tree is None else start.get(keys.GOAL)
-    whole = Simulation(rollouts, goal, tree, at_states=rollouts.collision, steps=steps, drawn=drawn)
+    goal = _branches(goal, chosen).flatten(1, 2)
+    whole = Simulation(rollouts, goal, tree, rollouts.collision, steps, drawn=drawn)
     if planned is None:
         return whole
     return _without_failed(whole, planned, _branches(ends.get(keys.PLANNER), chosen).flatten(1, 2))
 
 
-def simulate_batch(
-    agent: Agent,
-    scenes: SceneBatch,
-    config: EvaluateConfig,
-    *,
-    keep_tree: bool = False,
-    egos: EgoPlanners | None = None,
-    given: Int[Tensor, "B N"] | None = None,
-) -> Simulation:
-    """Simulate an agent: :func:`playback` of the log, or a :func:`simulation` whose collisions are found between
-    states, too.
+def simulate_batch(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, **how: Any) -> Simulation:
+    """Simulate an agent: :func:`playback` of the log, or a :func:`simulation`, whose arguments these are, with
+    collisions found between states, too.
     """
-    if agent.policy is not None or egos is not None:
-        found = simulation(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
-        rollouts = found.rollouts
-        between = between_states(scenes, rollouts.state, existing(scenes, rollouts))
-        return found._replace(rollouts=rollouts._replace(collision=between))
-    _check_given(agent, scenes, config, given)
+    if agent.policy is not None or how.get("egos") is not None:
+        found = simulation(agent, scenes, config, **how)
+        between = between_states(scenes, found.rollouts.state, existing(scenes, found.rollouts))
+        return found._replace(rollouts=found.rollouts._replace(collision=between))
+    _check_given(agent, scenes, config, how.get("given"))
     log = playback(scenes)
     at_states = _logged_collisions(scenes, at_states=True)[:, None, 1:]
     return Simulation(log, torch.full_like(log.state[:, :, 0, :, 0], -1, dtype=torch.int64), None, at_states)
 
 
-def acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig) -> TensorDictModuleBase:
-    """A policy with what a configuration changes in its draws, and with the rule that drives background agents.
-
-    Raises:
-        ConfigError: a temperature for a policy without discrete actions.
-    """
-    found = policy
+def _acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig) -> TensorDictModuleBase:
+    """A policy with what a configuration changes in its draws, and with the rule that drives background agents."""
     if config.action_temperature != 1.0:
         if keys.LOGITS not in policy.out_keys or not env.dynamics.discrete:
             raise ConfigError(
                 "this agent draws no discrete actions, so action-temperature means nothing to it"
             )
-        found = TensorDictSequential(found, Tempered(config.action_temperature))
-    if config.others in RULES:
-        found = TensorDictSequential(found, RULES[config.others](env))
-    return found
-
-
-def _placeholder(scenes: SceneBatch) -> TensorDictModuleBase:
-    """A policy for the ego of a planner beside log playback, whose actions nobody looks at."""
-    if int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > 1:
-        raise ConfigError("beside log playback the planner's ego is the only interactive agent")
-    return ConstantVelocity(Bicycle())
+        policy = TensorDictSequential(policy, tempered(config.action_temperature))
+    return TensorDictSequential(policy, RULES[config.others](env)) if config.others in RULES else policy
 
 
 def _ruled(
@@ -258,44 +229,28 @@ def _check_given(
         raise ConfigError(f"{agent.name} follows no goals, so a given one means nothing to it")
 
 
-def _fixed_goals(
-    scenes: SceneBatch, given: Int[Tensor, "B N"] | None, *, along_log: bool, ego: bool
-) -> Callable[[Tensor, Tensor], Tensor]:
-    """A function from rows of scenes [*b] and drawn goals [*b, N] to the goals that agents follow.
-
-    Args:
-        scenes: B scenes.
-        given: routes of agents, -1 where that is left open.
-        along_log: whether background agents follow the log's routes.
-        ego: whether the first agent of each scene does.
+def _fixed(
+    scenes: SceneBatch, row: Tensor, goal: Tensor, given: Tensor | None, *, along_log: bool, ego: bool
+) -> Tensor:
+    """Goals [*b, N] that agents follow in rows [*b] of the scenes instead of drawn ones: background agents and the
+    ego those of the log, if asked for, others those that are given.
     """
-
-    def fixed(scene: Tensor, goal: Tensor) -> Tensor:
-        logged = scenes.route_logged[scene]
-        if along_log:
-            goal = torch.where(scenes.background[scene], logged, goal)
-        if given is not None:
-            chosen = given.to(goal.device)[scene]
-            goal = torch.where(chosen >= 0, chosen, goal)
-        # Scenes without routes have no number of one either.
-        if ego and scenes.route_point.shape[1]:
-            goal = torch.cat([logged[..., :1], goal[..., 1:]], -1)
-        return goal
-
-    return fixed
+    followed = scenes.route_logged[row]
+    if along_log:
+        goal = torch.where(scenes.background[row], followed, goal)
+    if given is not None:
+        goal = torch.where(given.to(goal.device)[row] >= 0, given.to(goal.device)[row], goal)
+    # Scenes without routes have no number of one either.
+    along = ego and scenes.route_point.shape[1]
+    return torch.cat([followed[..., :1], goal[..., 1:]], -1) if along else goal
 
 
 def _without_failed(found: Simulation, planned: EgoPolicy | RuledEgo, number: Tensor) -> Simulation:
     """Steps after a planner, number [B, K, 1], failed don't count."""
-    scenes, rollouts = number.shape[:2]
-    each = planned.failures(number)
-    steps = found.rollouts.counted.shape[-2]
-    until = torch.tensor([steps if one is None else one.step for one in each], device=number.device)
-    going = torch.arange(steps, device=number.device) < until.reshape(scenes, rollouts, 1)
-    failed = tuple(
-        {k: one.reason for k, one in enumerate(each[b * rollouts : (b + 1) * rollouts]) if one is not None}
-        for b in range(scenes)
-    )
+    each, steps = [planned.failures(row) for row in number], found.rollouts.counted.shape[-2]
+    until = [[steps if one is None else one.step for one in row] for row in each]
+    going = torch.arange(steps, device=number.device) < torch.tensor(until, device=number.device)[..., None]
+    failed = tuple({k: one.reason for k, one in enumerate(row) if one is not None} for row in each)
     kept = found.rollouts._replace(counted=found.rollouts.counted & going[..., None])
     return found._replace(rollouts=kept, failed=failed)
 
@@ -304,17 +259,13 @@ def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
     """The configuration beside a planner of the ego: without a search unless one is asked for, as a search asks the
     planner once for each branch; trees where there shall be branches.
     """
-    if config.search != "agent":
-        return config
-    return dataclasses.replace(config, search="tree" if config.branches or config.trees > 1 else "none")
+    kind: Search = "tree" if config.branches or config.trees > 1 else "none"
+    return dataclasses.replace(config, search=kind if config.search == "agent" else config.search)
 
 
 def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) -> tuple[int, EvaluateConfig]:
-    """How many of the run segments give a number of runs together, and the configuration with as few rollouts of
-    each as that takes: what is independent of each other are segments.
-
-    It is exactly that number where some number of rollouts divides it that trees can share, else a few more. More
-    rollouts than a tree has branches come from as few trees as that takes.
+    """How many of the run segments give a number of runs together (a few more where it can't be divided so), and the
+    configuration with as few rollouts of each as that takes: what is independent of each other are segments.
     """
     plan, least = agent.plan(dataclasses.replace(config, rollouts=config.trees)), -(-runs // segments)
 
@@ -329,13 +280,8 @@ def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) 
 
 
 def filled_lines(totals: Float[Tensor, "B K P"], threshold: float) -> Int[Tensor, "B K"]:
-    """Which line stands in each place after backtracking: its own, but a good one of its scene where it stayed bad.
-
-    The places of bad lines take the good ones in turn, so that none is copied much more often than another.
-
-    Args:
-        totals: of the periods of every line.
-        threshold: the highest one of a good period.
+    """Which line stands in each place after backtracking: its own, but a good one of its scene where it stayed bad,
+    the total of some period being above the threshold. The places of bad lines take the good ones in turn.
     """
     good = (totals <= threshold).all(-1)
     count, place = good.sum(-1, keepdim=True), torch.arange(good.shape[-1], device=good.device)
@@ -346,8 +292,7 @@ def filled_lines(totals: Float[Tensor, "B K P"], threshold: float) -> Int[Tensor
 
 def _branches(part: Tensor, order: Tensor) -> Tensor:
     """part [B, trees, S, ...] at the branches order [B, trees, K]."""
-    index = order.reshape(*order.shape, *(1,) * (part.ndim - 3)).expand(*order.shape, *part.shape[3:])
-    return part.gather(2, index)
+    return part.take_along_dim(order.reshape(*order.shape, *(1,) * (part.ndim - 3)), 2)
 
 
 def playback(scenes: SceneBatch) -> Rollouts:
@@ -356,8 +301,7 @@ def playback(scenes: SceneBatch) -> Rollouts:
     row, height = torch.arange(len(scenes), device=log.device), logged_heights(scenes)
     height = None if height is None else height.flatten(1, 2)
     off = offroad_flags(scenes, row, log[..., :2].flatten(1, 2), height=height).view(valid.shape) & valid
-    hit = _logged_collisions(scenes)
-    return Rollouts(log[:, None], hit[:, None], off[:, None, 1:], valid[:, None, 1:])
+    return Rollouts(log[:, None], _logged_collisions(scenes)[:, None], off[:, None, 1:], valid[:, None, 1:])
 
 
 def _logged_collisions(scenes: SceneBatch, *, at_states: bool = False) -> Bool[Tensor, "B T N"]:
@@ -365,7 +309,5 @@ def _logged_collisions(scenes: SceneBatch, *, at_states: bool = False) -> Bool[T
     moves, valid = scenes.log_state.transpose(1, 2), scenes.log_valid.transpose(1, 2)
     subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)
     height = scenes.agent_height.transpose(1, 2) if scenes.agent_height.shape[1] else None
-    hit = collisions(
-        moves[..., :2], moves[..., 2], scenes.box_size, valid, subject, height, at_states=at_states
-    )
-    return hit.transpose(1, 2)
+    where, size = (moves[..., :2], moves[..., 2]), scenes.box_size
+    return collisions(*where, size, valid, subject, height, at_states=at_states).transpose(1, 2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -36,24 +35,17 @@ from symphony.rollouts.unroll import draw_goals
 from symphony.streams import Stream, fold_in, uniform
 
 FILL, FEW = 4, 256
-"""Lines that go back: those of so many times the usual run segments are simulated one after the other, as many at a
-time as usual, at least so many: else the last steps of every batch would be of few lines.
-"""
+"""Of lines that go back one in so many is simulated at a time, at least so many: the last steps are of few lines."""
 AHEAD = 0.5
 """Seconds that :func:`rule_score` looks ahead."""
-KEPT: Sequence[keys.Key] = [
+_KEPT = (
     *(keys.SCENE, keys.STEP, keys.STREAM, keys.VALID, keys.GOAL, keys.PROGRESS),
     *(keys.STATE, keys.ACTION, keys.NOISE),
     *(("next", *key) for key in (keys.STATE, keys.VALID, keys.PROGRESS, keys.COLLISION, keys.OFFROAD)),
-]
-"""Entries that are kept of every step of a search, enough to observe its states anew; beside them personas of agents
-that have some, and in open traffic who has not entered yet.
-"""
+)
 
 
-def _settings(
-    env: DrivingEnv, rule: PruningRule | Backtrack, also: Sequence[keys.Key] = ()
-) -> dict[str, Any]:
+def _settings(env: DrivingEnv, rule: PruningRule | Backtrack, also: Sequence[Any] = ()) -> dict[str, Any]:
     """Settings that every search of driving gives the collector."""
     persona = [keys.PERSONA] if env.observation.persona else []
     waiting = [keys.WAITING] if env.open_traffic else []
@@ -62,20 +54,18 @@ def _settings(
         # A copy takes the random numbers of the place it lands in, so that forks part.
         "slot_keys": (keys.STREAM,),
         "group_key": keys.GOAL if takes_groups(rule) else None,
-        "keep": [*KEPT, *persona, *waiting, *also],
+        # Of every step enough to observe its states anew.
+        "keep": [*_KEPT, *persona, *waiting, *also],
     }
 
 
 def pruning_rule(config: SearchConfig) -> PruningRule:
     """Which branches go on."""
-    if ":" in config.rule:
-        return load_object(config.rule)()
-    rules: dict[str, Callable[[], PruningRule]] = {
-        "best": lambda: KeepBest(0.5),
-        "systematic": lambda: Systematic(config.temperature),
-        "replace": lambda: ReplaceBad(config.threshold),
-    }
-    return rules[config.rule]()
+    if config.rule == "best":
+        return KeepBest(0.5)
+    if config.rule == "systematic":
+        return Systematic(config.temperature)
+    return ReplaceBad(config.threshold) if config.rule == "replace" else load_object(config.rule)()
 
 
 def flag_score(state: TensorDictBase) -> Float[Tensor, "*b N"]:
@@ -85,10 +75,8 @@ def flag_score(state: TensorDictBase) -> Float[Tensor, "*b N"]:
 
 
 def rule_score(env: DrivingEnv, state: TensorDictBase) -> Float[Tensor, "*b N"]:
-    """Score [..., N] of a rule: 1 where an agent collides, is off the road, or would collide within
-    :data:`AHEAD`, were everyone to keep speed and course.
-
-    It looks at everybody, so that it says the same of agents that observe little.
+    """Score [..., N] of a rule: 1 where an agent collides, is off the road, or would within :data:`AHEAD` collide,
+    observed or not, were everyone to keep speed and course.
     """
     there, row = state.get(keys.VALID), state.get(keys.SCENE).flatten()
     moves, real = (state.get(key).flatten(0, state.ndim - 1) for key in (keys.STATE, keys.VALID))
@@ -106,22 +94,17 @@ def realism_score(
     score: Score = "discriminator",
     ego: bool = True,
 ) -> Callable[[TensorDictBase], Tensor]:
-    """Scores [..., N] of states.
-
-    Args:
-        env: whose states are scored.
-        discriminator: writes them, where they are its own.
-        score: what a search looks for in a state.
-        ego: whether the first agent is scored; else its score is 0, as that of background agents is.
+    """A function that scores states [..., N], by the discriminator or by what agents do; 0 for background agents, and
+    for the first agent if the ego is not to be scored.
     """
-    of_states: Callable[[TensorDictBase], Tensor]
-    if score == "discriminator":
-        of_states = KeyScore(keys.SCORE, discriminator, valid_key=keys.VALID)
-    else:
-        of_states = flag_score if score == "flags" else partial(rule_score, env)
+    learned = KeyScore(keys.SCORE, discriminator, valid_key=keys.VALID) if score == "discriminator" else None
 
     def of_scored(state: TensorDictBase) -> Float[Tensor, "*b N"]:
-        found = of_states(state).masked_fill(env.scenes.background[state.get(keys.SCENE).squeeze(-1)], 0.0)
+        if learned is not None:
+            found = learned(state)
+        else:
+            found = flag_score(state) if score == "flags" else rule_score(env, state)
+        found = found.masked_fill(env.scenes.background[state.get(keys.SCENE).squeeze(-1)], 0.0)
         return found if ego else torch.cat([torch.zeros_like(found[..., :1]), found[..., 1:]], -1)
 
     return of_scored
@@ -140,14 +123,8 @@ def with_drawn_goals(
     seed: int,
     goals_per: Literal["tree", "branch"] = "tree",
 ) -> TensorDictBase:
-    """Start states [*b, S] of a search, with :func:`branched_streams` and routes that the goal policy draws.
-
-    Args:
-        env: the environment.
-        goals: the goal policy.
-        start: all branches of a tree, in one stream of random numbers.
-        seed: of the draw.
-        goals_per: who draws goals together: all branches of a tree (paper, section IV-B), or each branch alone.
+    """Start states [*b, S] of a search, with :func:`branched_streams` and routes that the goal policy draws: once for
+    all branches of a tree (paper, section IV-B), or for each branch alone.
     """
     start = branched_streams(start)
     first = start if goals_per == "branch" else start[..., :1]
@@ -156,8 +133,8 @@ def with_drawn_goals(
 
 
 def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
-    """Numbers [*b, P] for the rule from a start state [*b, S]: the tree's, which are those of its first branch, told
-    apart from its actions'.
+    """Numbers [*b, P] for the rule from a start state [*b, S]: those of the tree's first branch, told apart from its
+    actions'.
     """
 
     def noise(start: TensorDictBase, periods: int) -> Float[Tensor, "*b P"]:
@@ -170,15 +147,8 @@ def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
 def collector_settings(
     config: SearchConfig, env: DrivingEnv, seed: int, data: SceneDataset, segments: int
 ) -> dict[str, Any]:
-    """Settings that a collector of driving needs beside environment, policy and scores: whole trees, random numbers
-    that depend on nothing but seed, segment, branch and step.
-
-    Args:
-        config: of the search.
-        env: that is searched.
-        seed: of the pruning.
-        data: that the environment draws its scenes from.
-        segments: how many at a time, or all, if there are fewer.
+    """Settings that a collector of driving needs beside environment, policy and scores: whole trees of so many run
+    segments at a time, random numbers that depend on nothing but seed, segment, branch and step.
     """
     return {
         "branches": config.branches,
@@ -202,26 +172,15 @@ def search(
     rule: PruningRule | Backtrack,
     prune_every: int,
     score: Score = "discriminator",
-    leaves: int | None = None,
-    keep_tree: bool = False,
     ego: bool = True,
     also: Sequence[keys.Key] = (),
+    **returned: Any,
 ) -> BeamSearchResult:
-    """Beam search from a start state [..., S] to the last logged step. Scenes beside each other change nothing.
+    """Beam search from a start state [..., S], all branches of a tree, to the last logged step. Scenes beside each
+    other change nothing.
 
-    Args:
-        env: the environment.
-        policy: writes the action.
-        discriminator: scores the states, where the score is its own.
-        start: all branches of a tree.
-        seed: of the actions.
-        rule: which branches go on.
-        prune_every: T_p.
-        score: what it looks for.
-        leaves: return only so many of each tree, the best of their scene's last period; by default all.
-        keep_tree: also return the pruned branches.
-        ego: whether the first agent is scored, too.
-        also: what is kept of every step beside :data:`KEPT`.
+    It prunes every T_p steps by :func:`realism_score`, and keeps of every step what it takes to observe its states
+    anew, and what is named in ``also``; what is returned are settings of :func:`symphony.collectors.beam_search`.
     """
     steps = env.decisions
     try:
@@ -234,9 +193,8 @@ def search(
             prune_every=prune_every,
             rule=rule,
             noise=pruning_noise(seed)(start, -(-steps // prune_every)),
-            leaves=leaves,
-            keep_tree=keep_tree,
             **_settings(env, rule, also),
+            **returned,
         )
     except ValueError as error:  # of a rule or a score of the user
         raise ConfigError(str(error)) from error
@@ -245,13 +203,8 @@ def search(
 def going_back(
     env: DrivingEnv, threshold: float, lines: int, begin: Callable[[TensorDictBase], TensorDictBase]
 ) -> Backtrack:
-    """The rule by which lines go back in the driving environment, with random numbers of their own at every try.
-
-    Args:
-        env: the environment.
-        threshold: of the totals.
-        lines: how many there are; one in :data:`FILL` is simulated at a time, at least :data:`FEW`.
-        begin: from first states [R, 1] to others with goals drawn anew: those kept may not be met by anybody.
+    """The rule by which lines go back in the driving environment, with random numbers of their own at every try, and
+    at the first states [R, 1] with goals that ``begin`` draws anew: those kept may not be met by anybody.
     """
 
     def renew(state: TensorDictBase, attempt: Int[Tensor, " R"]) -> TensorDictBase:

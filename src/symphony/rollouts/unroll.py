@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -17,23 +17,21 @@ from symphony import keys
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.objects import rollout_heights
 from symphony.envs.scene import SceneBatch
+from symphony.errors import SymphonyError
+from symphony.geometry.nearest import on_host
 from symphony.metrics import collisions
 from symphony.modules import drawn_goals
 from symphony.streams import Stream, fold_in, uniform
 
 _WORLD = 1 << 22
 """Agents times states of scenes that are looked at together."""
+_NEVER = 1 << 30
 
 
 class Rollouts(NamedTuple):
-    """Rollouts of the interactive agents over T simulated steps, after the first state.
-
-    Attributes:
-        state: [..., T + 1, N, 4] x, y, heading, speed, the first state included.
-        collision: [..., T, N]; see :func:`between_states` for what is found between states.
-        offroad: [..., T, N].
-        counted: [..., T, N] steps that are evaluated: of real agents while they are there, up to the segment's last
-            logged step.
+    """Rollouts of the interactive agents: states x, y, heading, speed, the first one included; collisions (see
+    :func:`between_states` for those between states) and time off the road after each of T steps; and which of these
+    are evaluated: of real agents while they are there, up to the segment's last logged step.
     """
 
     state: Float[Tensor, "*b T+1 N 4"]
@@ -53,15 +51,10 @@ def simulate(
     start: TensorDictBase,
     steps: int | None = None,
 ) -> Rollouts:
-    """Roll a policy out from a start state.
+    """Roll a policy, which writes the action, out from a start state of :meth:`DrivingEnv.start` of any batch shape,
+    by default up to the last logged step of the longest scene.
 
     Only states and flags are kept: the observations of sixteen rollouts would take gigabytes.
-
-    Args:
-        env: the environment.
-        policy: writes the action into the TensorDict it is given.
-        start: as returned by :meth:`DrivingEnv.start`, any batch shape.
-        steps: decisions; by default up to the last logged step of the longest scene.
     """
     steps = env.decisions if steps is None else steps
     now, states, collisions, offroads, there = start, [start.get(keys.STATE)], [], [], []
@@ -72,35 +65,20 @@ def simulate(
             collisions.append(now.get(keys.COLLISION).squeeze(-1))
             offroads.append(now.get(keys.OFFROAD).squeeze(-1))
             there.append(now.get(keys.VALID))
-    return Rollouts(
-        torch.stack(states, -3),
-        torch.stack(collisions, -2),
-        torch.stack(offroads, -2),
-        counted_steps(env, start, torch.stack(there, -2)),
-    )
+    counted = _counted(env, start, torch.stack(there, -2))
+    return Rollouts(torch.stack(states, -3), torch.stack(collisions, -2), torch.stack(offroads, -2), counted)
 
 
 @torch.no_grad()
 def draw_goals(
-    env: DrivingEnv,
-    goals: TensorDictModuleBase,
-    start: TensorDictBase,
-    seed: int,
-    tree: Int[Tensor, "*b"],
+    env: DrivingEnv, goals: TensorDictModuleBase, start: TensorDictBase, seed: int, tree: Int[Tensor, "*b"]
 ) -> Int[Tensor, "*b N"]:
-    """The route [..., N] each agent follows from a start state, -1 for none.
+    """The route [..., N] that the goal policy draws for each agent from a start state, -1 for none; ``tree`` is the
+    number of the draw within its scene.
 
     In open traffic, agents that enter later draw as if all of them were there already.
-
-    Args:
-        env: the environment.
-        goals: the goal policy.
-        start: [...], one entry per draw.
-        seed: of the draw.
-        tree: [...] number of the draw within its scene, so that it is the same whatever the batch.
     """
-    stream = fold_in(fold_in(env.scenes.stream[start.get(keys.SCENE)], Stream.GOALS), tree[..., None])
-    noise = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=start.device)), 0)
+    noise = _drawn(env, start.get(keys.SCENE), seed, Stream.GOALS, tree)
 
     def drawn(state: TensorDictBase) -> Tensor:
         seen = env.choices(state).set(keys.GOAL_NOISE, noise)
@@ -115,25 +93,12 @@ def draw_goals(
     return torch.where(waiting, drawn(everyone), found)
 
 
-def draw_personas(
-    env: DrivingEnv,
-    personas: Float[Tensor, "M 2"],
-    scene: Int[Tensor, "*b"],
-    seed: int,
-    number: Int[Tensor, "*b"],
-) -> Float[Tensor, "*b N 2"]:
-    """The style in which each agent drives from a start state on.
-
-    Args:
-        env: the environment.
-        personas: to draw from, equally likely.
-        scene: rows of the scene batch, one per draw.
-        seed: of the draw.
-        number: [...] of the draw within its scene.
-    """
-    stream = fold_in(fold_in(env.scenes.stream[scene], Stream.PERSONAS), number)[..., None]
-    share = uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=scene.device)), 0)
-    return personas[(share * len(personas)).long()]
+def _drawn(
+    env: DrivingEnv, scene: Int[Tensor, "*b 1"], seed: int, use: Stream, number: Int[Tensor, "*b"]
+) -> Float[Tensor, "*b N"]:
+    """A number for each agent, of a use and a draw within the scene."""
+    stream = fold_in(fold_in(env.scenes.stream[scene], use), number[..., None])
+    return uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=scene.device)), 0)
 
 
 def start_states(
@@ -146,21 +111,13 @@ def start_states(
     logged_goals: bool = False,
     goals_per: Literal["tree", "branch"] = "tree",
     personas: Float[Tensor, "M 2"] | None = None,
-    fix: Callable[[Tensor, Tensor], Tensor] | None = None,
+    fix: Callable[[Tensor, Tensor], Tensor] = lambda scene, goal: goal,
 ) -> TensorDictBase:
     """First states [B, trees, branches] of all scenes, observed once they have their goals and personas.
 
-    Args:
-        env: the environment.
-        goals: the goal policy; None for agents that follow none.
-        trees: per scene.
-        branches: per tree.
-        seed: of the goals.
-        logged_goals: take the routes nearest to the log instead.
-        goals_per: who draws goals, and personas, together: all branches of a tree (paper, section IV-B), or each
-            branch alone.
-        personas: that agents drive in, to draw from; None for agents without.
-        fix: from rows of the scenes [*b] and goals [*b, N] to the goals that agents follow.
+    Goals are drawn by the goal policy, if there is one, or those nearest to the log; personas from M equally likely
+    ones: once for all branches of a tree (paper, section IV-B), or for each branch alone. ``fix`` gives the goals
+    that agents follow, from rows of the scenes [*b] and these goals [*b, N].
     """
     device, shape = env.scenes.device, (len(env.scenes), trees, branches)
     scene = torch.arange(len(env.scenes), device=device)[:, None, None].expand(shape)
@@ -168,7 +125,8 @@ def start_states(
     goal, persona = torch.full((*shape, env.num_agents), -1, device=device), None
     if personas is not None:
         first = number if goals_per == "branch" else number[..., :1].expand(shape)
-        persona = draw_personas(env, personas, scene, seed, first)
+        share = _drawn(env, scene[..., None], seed, Stream.PERSONAS, first)
+        persona = personas[(share * len(personas)).long()]
     if goals is not None and logged_goals:
         goal = env.scenes.route_logged[scene]
     elif goals is not None and goals_per == "branch":
@@ -179,26 +137,19 @@ def start_states(
         tree = torch.arange(trees, device=device).expand(shape[:2])
         drawn = draw_goals(env, goals, env.start(scene[..., 0], number[..., 0], persona=styles), seed, tree)
         goal = drawn[:, :, None].expand(*shape, -1)
-    if fix is not None:
-        goal = fix(scene, goal)
-    return env.start(scene, number, goal, persona)
+    return env.start(scene, number, fix(scene, goal), persona)
 
 
 def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDictBase) -> Rollouts:
     """The rollouts that the evaluator reads, from leaves [..., L, T] of a search from ``start`` [..., S], S >= L."""
-    start = start[..., : trajectories.shape[-2]]
-    state = torch.cat([start.get(keys.STATE)[..., None, :, :], trajectories.get(("next", *keys.STATE))], -3)
-    collision, offroad = (
-        trajectories.get(("next", *key)).squeeze(-1) for key in (keys.COLLISION, keys.OFFROAD)
-    )
-    there = trajectories.get(("next", *keys.VALID))
-    return Rollouts(state, collision, offroad, counted_steps(env, start, there))
+    start, after = start[..., : trajectories.shape[-2]], trajectories.get("next")
+    state = torch.cat([start.get(keys.STATE)[..., None, :, :], after.get(keys.STATE)], -3)
+    collision, offroad = (after.get(key).squeeze(-1) for key in (keys.COLLISION, keys.OFFROAD))
+    return Rollouts(state, collision, offroad, _counted(env, start, after.get(keys.VALID)))
 
 
-def counted_steps(
-    env: DrivingEnv, start: TensorDictBase, there: Bool[Tensor, "*b T N"]
-) -> Bool[Tensor, "*b T N"]:
-    """The steps after which agents are there and their segment still has logged steps."""
+def _counted(env: DrivingEnv, start: TensorDictBase, there: Tensor) -> Bool[Tensor, "*b T N"]:
+    """The steps after which agents are there [..., T, N] and their segment still has logged steps."""
     step = start.get(keys.STEP) + torch.arange(1, there.shape[-2] + 1, device=start.device)
     return (step <= env.scenes.last_step[start.get(keys.SCENE)])[..., None] & there
 
@@ -212,13 +163,8 @@ def existing(scenes: SceneBatch, rollouts: Rollouts) -> Bool[Tensor, "B K T+1 N"
 def between_states(
     scenes: SceneBatch, state: Float[Tensor, "B K T+1 N 4"], there: Bool[Tensor, "B K T+1 N"]
 ) -> Bool[Tensor, "B K T N"]:
-    """Whether the box of each driven agent overlaps another's on its level at some time of each step (see
+    """Whether the box of each driven agent, where it is there, overlaps another's at some time of each step (see
     :func:`symphony.metrics.collisions`), among all others of its scene as they were driven or logged.
-
-    Args:
-        scenes: B scenes.
-        state: of the driven agents.
-        there: where they are.
     """
     steps, count = state.shape[2], scenes.log_state.shape[2]
     subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)
@@ -239,7 +185,69 @@ def between_states(
         pose = pose.scatter(-2, index[..., None].expand_as(moved), moved.to(pose.dtype))
         seen = seen.scatter(-1, index, there[part])
         pose, seen = pose[..., :count, :].transpose(2, 3), seen[..., :count].transpose(2, 3)
-        size = scenes.box_size[part, None]
-        at = None if level is None else pose[..., 3:]
+        size, at = scenes.box_size[part, None], None if level is None else pose[..., 3:]
         found.append(collisions(pose[..., :2], pose[..., 2], size, seen, subject[part, None], at))
     return torch.cat(found).transpose(2, 3) & there[:, :, 1:]
+
+
+class NotFiniteError(SymphonyError):
+    """A network put out a number that is not finite, first for some agent (the ego is 0) of a row of the scenes at
+    some step; comparisons with NaN would choose in silence.
+    """
+
+    def __init__(self, what: str, row: int, step: int, agent: int, name: str = "") -> None:
+        super().__init__(what, row, step, agent, name)
+        self.row = row
+
+    def __str__(self) -> str:
+        what, _, step, agent, name = self.args
+        where = f"segment {name}: " if name else ""
+        return f"{where}the {what} put out a number that is not finite for agent {agent} at step {step}"
+
+    def named(self, segment: str) -> NotFiniteError:
+        """The same error, with the segment's name."""
+        what, row, step, agent, _ = self.args
+        return NotFiniteError(what, row, step, agent, segment)
+
+
+class NaNGuard(TensorDictModuleBase):
+    """A module that remembers in which scenes, and when first, a guarded entry [*b, N, ...] that it put out was not
+    finite for a valid agent; looked at once, at the end, so that no step waits for the device.
+
+    One that scores sees the last state of a scene, too, others act in those before. Past a scene's end there is only
+    the padding of its batch.
+    """
+
+    def __init__(
+        self, env: DrivingEnv, module: TensorDictModuleBase, guarded: Sequence[keys.Key], what: str,
+        *, scores: bool = False,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.env, self.module, self.guarded, self.what, self.scores = env, module, guarded, what, scores
+        self.in_keys, self.out_keys = module.in_keys, module.out_keys
+        # Of each scene the first step and the first agent of it, as one number.
+        self._first = torch.full((len(env.scenes),), _NEVER, device=env.scenes.device)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Call the module."""
+        out = self.module(tensordict)
+        for key in self.guarded:
+            value = out.get(key, None)
+            if value is not None and value.is_floating_point():
+                self._see(out, value)
+        return out
+
+    def _see(self, tensordict: TensorDictBase, value: Tensor) -> None:
+        if on_host(value) and bool(value.sum().isfinite()):
+            return  # a sum of numbers one of which is not finite isn't either
+        valid = tensordict.get(keys.VALID)
+        wrong = valid & ~value.isfinite().reshape(*valid.shape, -1).all(-1)
+        scene, step = tensordict.get(keys.SCENE).squeeze(-1), tensordict.get(keys.STEP).squeeze(-1)
+        bad = wrong.any(-1) & (step < self.env.scenes.last_step[scene] + self.scores)
+        step = torch.where(bad, step * self.env.num_agents + wrong.int().argmax(-1), _NEVER)
+        self._first = self._first.scatter_reduce(0, scene.flatten(), step.flatten(), "amin")
+
+    def check(self) -> None:
+        """Raise NotFiniteError for the first scene in which something was not finite."""
+        for row in (self._first < _NEVER).nonzero()[:1].flatten().tolist():
+            raise NotFiniteError(self.what, row, *divmod(int(self._first[row]), self.env.num_agents))

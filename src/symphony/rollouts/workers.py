@@ -16,14 +16,12 @@ from symphony.errors import ConfigError, SymphonyError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.parallel import WorkerError, ordered_map
 from symphony.rollouts.search import FILL
+from symphony.rollouts.unroll import NotFiniteError
 
 POINTS = 1 << 19
 """Map points that all agents of a batch see together, at most: some 50 MB of features."""
-IN_TRAFFIC = 32
-"""Agents that a run segment is taken to have where everyone is driven: all of a batch have room for as many as the
-fullest."""
-NAMED = 8
-"""Run segments of a batch that an error names, at most."""
+IN_TRAFFIC, NAMED = 32, 8
+"""Agents that a run segment is taken to have where everyone is driven; segments that an error names, at most."""
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -33,12 +31,8 @@ Work = Callable[[T], R]
 
 def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) -> int:
     """Run segments to simulate at a time: as many as the configuration says. Where it leaves that open, up to
-    ``TOGETHER``, as a step of few agents costs little less than one of many; fewer if they see more than ``POINTS``.
-
-    Args:
-        agent: that drives.
-        config: in how many rollouts and branches.
-        interactive: agents per segment, where not everyone is driven.
+    ``TOGETHER``, as a step of few agents costs little less than one of many; fewer if they see more than ``POINTS``,
+    each with so many interactive agents where not everyone is driven.
     """
     if config.batch:
         return config.batch
@@ -61,11 +55,8 @@ def batches(items: Sequence[int], size: int, config: EvaluateConfig) -> list[lis
 def shared(
     work: Work[T, R], tasks: Iterable[T], config: EvaluateConfig, dataset: SceneDataset | None = None
 ) -> Generator[R, None, None]:
-    """The results of some work on every task, in the order of the tasks, by ``config.workers`` processes.
-
-    With a dataset, tasks are a list of batches of its items.
-
-    One local worker is this very process. ``close`` ends the others.
+    """The results of some work on every task, in the order of the tasks, by ``config.workers`` processes; one local
+    worker is this very process. ``close`` ends the others. With a dataset, tasks are a list of batches of its items.
 
     Raises:
         ConfigError: the work can't be sent to another process, or Ray is not installed.
@@ -79,10 +70,8 @@ def shared(
         sent = pickle.dumps(work)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise ConfigError(f"can't be shared among processes: {error}") from error
-    pairs = ((sent, task) for task in tasks)
-    done = ordered_map(
-        _done, pairs, workers=config.workers, engine=config.engine, imports=[type(work).__module__]
-    )
+    pairs, imports = ((sent, task) for task in tasks), [getattr(work, "func", type(work)).__module__]
+    done = ordered_map(_done, pairs, workers=config.workers, engine=config.engine, imports=imports)
     with closing(done) as results:
         try:
             for result in results:
@@ -97,9 +86,11 @@ def shared(
 
 @contextmanager
 def naming(dataset: SceneDataset, items: Sequence[int]) -> Iterator[None]:
-    """An unexpected error inside names the run segments at hand; those of this package do so themselves."""
+    """Errors inside name the run segment they are about, unexpected ones all that are at hand."""
     try:
         yield
+    except NotFiniteError as error:
+        raise error.named(dataset.store.ids[dataset.indices[items[error.row]]]) from error
     except SymphonyError:
         raise
     except Exception as error:
@@ -108,9 +99,8 @@ def naming(dataset: SceneDataset, items: Sequence[int]) -> Iterator[None]:
 
 
 def _names(dataset: SceneDataset, items: Sequence[int]) -> str:
-    names = ", ".join(dataset.store.ids[dataset.indices[i]] for i in items[:NAMED])
-    more = len(items) - NAMED
-    return f"{names} and {more} more (batches of 1 tell which)" if more > 0 else names
+    names, more = [dataset.store.ids[dataset.indices[i]] for i in items[:NAMED]], len(items) - NAMED
+    return ", ".join(names) + (f" and {more} more (batches of 1 tell which)" if more > 0 else "")
 
 
 @lru_cache(1)

@@ -8,20 +8,18 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 import zlib
-from itertools import groupby
+from itertools import count, groupby
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.segment import AgentType, LaneType, Polylines, RunSegment, SignalState
-from symphony.saved.rollouts import PLAYBACK, SavedRollouts
-from symphony.saved.world import World, world_of
+from symphony.saved.rollouts import PLAYBACK, SavedRollouts, World, world_of
 
 Reals = NDArray[np.float64]
 
-WIDTHS = {LaneType.BIKE_LANE: 1.6}
-NOMINAL_WIDTH = 3.6
+NOMINAL_WIDTH, BIKE_WIDTH = 3.6, 1.6
 """Metres, of lanes whose width is not known."""
 TRUCK = 7.0
 """Metres of length from which a vehicle is a truck."""
@@ -44,10 +42,6 @@ def commonroad(saved: SavedRollouts, rollout: int) -> str:
     one that is lost for some steps becomes an obstacle more for each stretch. Lanelets lie half a lane's width to
     either side of the centre lines, nominal where the width is not known; lanes of a single point are left out.
     Lights that flash or are not known are inactive.
-
-    Args:
-        saved: the rollouts.
-        rollout: which of them.
     """
     segment = saved.segment
     letters = "".join(word.capitalize() for word in re.findall("[A-Za-z]+", segment.segment_id)) or "Segment"
@@ -63,10 +57,10 @@ def commonroad(saved: SavedRollouts, rollout: int) -> str:
         source=f"symphony: segment {segment.segment_id}, rollout {rollout}",
         date="1970-01-01",
     )
-    location = ET.SubElement(root, "location")
+    location = _add(root, "location")
     for tag, value in (("geoNameId", "-999"), ("gpsLatitude", "999"), ("gpsLongitude", "999")):
-        _text(location, tag, value)
-    ET.SubElement(ET.SubElement(root, "scenarioTags"), "simulated")
+        _add(location, tag, value)
+    _add(_add(root, "scenarioTags"), "simulated")
     obstacles = _obstacles(saved, rollout)
     # Of a run that failed at once nobody may be left.
     taken = max((int(obstacle.get("id", 0)) for obstacle in obstacles), default=0)
@@ -76,77 +70,73 @@ def commonroad(saved: SavedRollouts, rollout: int) -> str:
     return "<?xml version='1.0' encoding='UTF-8'?>\n" + ET.tostring(root, encoding="unicode") + "\n"
 
 
-def _text(parent: ET.Element, tag: str, value: Any) -> ET.Element:
-    node = ET.SubElement(parent, tag)
-    node.text = value if isinstance(value, str) else f"{value:.6f}"
+def _add(parent: ET.Element, tag: str, value: Any = None, **attributes: Any) -> ET.Element:
+    node = ET.SubElement(parent, tag, {name: str(held) for name, held in attributes.items()})
+    if value is not None:
+        node.text = value if isinstance(value, str) else f"{float(value):.6f}"
     return node
 
 
-def _point(parent: ET.Element, place: Any) -> None:
-    node = ET.SubElement(parent, "point")
-    for tag, value in zip("xy", place, strict=True):
-        _text(node, tag, float(value))
+def _point(parent: ET.Element, tag: str, place: Any) -> None:
+    node = _add(parent if tag == "point" else _add(parent, tag), "point")
+    for axis, value in zip("xy", place, strict=True):
+        _add(node, axis, value)
 
 
 def _obstacles(saved: SavedRollouts, rollout: int) -> list[ET.Element]:
     segment, world = saved.segment, world_of(saved, rollout)
     ids = segment.agent_id + max(0, 1 - int(segment.agent_id.min()))
-    spare = int(ids.max())
+    spare = count(int(ids.max()) + 1)
     found = []
     for row in np.flatnonzero(world.valid.any(1)).tolist():
         seen = np.flatnonzero(world.valid[row])
         for k, steps in enumerate(np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1)):
-            spare += k > 0
-            node = ET.Element("dynamicObstacle", id=str(spare if k else int(ids[row])))
-            kind, length = AgentType(segment.agent_type[row]), segment.size[row, 0]
+            node = ET.Element("dynamicObstacle", id=str(next(spare) if k else int(ids[row])))
+            kind, (length, width) = AgentType(segment.agent_type[row]), segment.size[row, :2]
             vehicle = "truck" if length >= TRUCK else "car"
-            _text(node, "type", vehicle if kind == AgentType.VEHICLE else _TYPES.get(kind, "unknown"))
-            shape = ET.SubElement(ET.SubElement(node, "shape"), "rectangle")
-            for tag, value in zip(("length", "width"), segment.size[row], strict=False):
-                _text(shape, tag, float(value))
-            _state(ET.SubElement(node, "initialState"), world, row, int(steps[0]), segment.origin)
-            if len(steps) > 1:
-                trajectory = ET.SubElement(node, "trajectory")
-                for step in steps[1:].tolist():
-                    _state(ET.SubElement(trajectory, "state"), world, row, step, segment.origin)
+            _add(node, "type", vehicle if kind == AgentType.VEHICLE else _TYPES.get(kind, "unknown"))
+            shape = _add(_add(node, "shape"), "rectangle")
+            _add(shape, "length", length)
+            _add(shape, "width", width)
+            _state(_add(node, "initialState"), world, row, steps[0], segment.origin)
+            trajectory = _add(node, "trajectory") if len(steps) > 1 else node
+            for step in steps[1:]:
+                _state(_add(trajectory, "state"), world, row, step, segment.origin)
             found.append(node)
     return found
 
 
 def _state(node: ET.Element, world: World, row: int, step: int, origin: Reals) -> None:
-    _point(ET.SubElement(node, "position"), world.position[row, step] + origin[:2])
-    _text(ET.SubElement(node, "orientation"), "exact", float(world.heading[row, step]))
-    _text(ET.SubElement(node, "time"), "exact", str(step))
-    _text(ET.SubElement(node, "velocity"), "exact", float(world.speed[row, step]))
+    _point(node, "position", world.position[row, step] + origin[:2])
+    for tag, value in (
+        ("orientation", world.heading[row, step]),
+        ("time", str(step)),
+        ("velocity", world.speed[row, step]),
+    ):
+        _add(_add(node, tag), "exact", value)
 
 
 class _Network:
     """Lanelets, speed limits, lights and the turns at intersections, with ids from ``first`` on."""
 
     def __init__(self, segment: RunSegment, within: slice, first: int) -> None:
-        self.segment, self.road, self.within, self.next = segment, segment.road, within, first
+        self.segment, self.road, self.within, self.number = segment, segment.road, within, count(first)
         self.lines = {}
         for k in range(len(self.road.lanes)):
             line = self.road.lanes[k][:, :2].astype(np.float64)
             line = line[np.concatenate([[True], (np.diff(line, axis=0) != 0).any(1)])]
             if len(line) > 1:
                 self.lines[k] = line + segment.origin[:2]
-        self.ids = {k: self._number() for k in self.lines}
+        self.ids = {k: next(self.number) for k in self.lines}
         self.flow = self._pairs("successors")
 
-    def _number(self) -> int:
-        self.next += 1
-        return self.next - 1
-
     def _pairs(self, name: str) -> list[tuple[int, int]]:
-        pairs = getattr(self.road, name).tolist()
-        return [(a, b) for a, b in pairs if a in self.lines and b in self.lines]
+        return [(a, b) for a, b in getattr(self.road, name).tolist() if a in self.lines and b in self.lines]
 
     def add(self, root: ET.Element) -> None:
         """Add all elements in the order that the format wants."""
-        limits = self.road.speed_limit
-        known = limits[list(self.lines)]
-        signs = {float(limit): self._number() for limit in np.unique(known[np.isfinite(known)])}
+        limits = {k: float(self.road.speed_limit[k]) for k in self.lines}
+        signs = {limit: next(self.number) for limit in sorted({x for x in limits.values() if np.isfinite(x)})}
         # Id, row, lanes that lead to it, and the direction it is for: the format hangs a light on the lane before it
         # and tells turns apart by direction.
         lights: list[tuple[int, int, list[int], str]] = []
@@ -154,52 +144,53 @@ class _Network:
             if lane in self.lines:
                 before = [a for a, b in self.flow if b == lane]
                 turn = self._turn(lane) if before else "all"
-                lights.append((self._number(), light, before or [lane], turn))
+                lights.append((next(self.number), light, before or [lane], turn))
         for k in self.lines:
-            refs = [("trafficSignRef", signs[limit]) for limit in [float(limits[k])] if limit in signs]
+            refs = [("trafficSignRef", signs[limits[k]])] if limits[k] in signs else []
             refs += [("trafficLightRef", number) for number, _, lanes, _ in lights if k in lanes]
             self._lanelet(root, k, refs)
         for limit, number in signs.items():
-            node = ET.SubElement(root, "trafficSign", id=str(number))
-            element = ET.SubElement(node, "trafficSignElement")
-            _text(element, "trafficSignID", "274")
-            _text(element, "additionalValue", limit)
-            first = next(k for k in self.lines if float(limits[k]) == limit)
-            _point(ET.SubElement(node, "position"), self.lines[first][0])
-            _text(node, "virtual", "true")
+            node = _add(root, "trafficSign", id=number)
+            element = _add(node, "trafficSignElement")
+            _add(element, "trafficSignID", "274")
+            _add(element, "additionalValue", limit)
+            _point(node, "position", self.lines[next(k for k in self.lines if limits[k] == limit)][0])
+            _add(node, "virtual", "true")
         for number, light, _, turn in lights:
             self._light(root, number, light, turn)
         # An intersection for each lane with lights, so that readers can tell which way each of its turns goes.
         for lane in sorted({lane for _, _, lanes, turn in lights for lane in lanes if turn != "all"}):
-            node = ET.SubElement(root, "intersection", id=str(self._number()))
-            incoming = ET.SubElement(node, "incoming", id=str(self._number()))
-            ET.SubElement(incoming, "incomingLanelet", ref=str(self.ids[lane]))
+            node = _add(root, "intersection", id=next(self.number))
+            incoming = _add(node, "incoming", id=next(self.number))
+            _add(incoming, "incomingLanelet", ref=self.ids[lane])
             after = sorted((self._turn(b), b) for a, b in self.flow if a == lane)
             for turn in ("right", "straight", "left"):
                 for _, other in (pair for pair in after if pair[0] == turn):
-                    ET.SubElement(incoming, f"successors{turn.capitalize()}", ref=str(self.ids[other]))
+                    _add(incoming, f"successors{turn.capitalize()}", ref=self.ids[other])
 
     def _lanelet(self, root: ET.Element, k: int, refs: list[tuple[str, int]]) -> None:
-        node = ET.SubElement(root, "lanelet", id=str(self.ids[k]))
+        node = _add(root, "lanelet", id=self.ids[k])
         width, kind = float(self.road.lane_width[k]), LaneType(self.road.lane_type[k])
         if not np.isfinite(width):
-            width = WIDTHS.get(kind, NOMINAL_WIDTH)
+            width = BIKE_WIDTH if kind == LaneType.BIKE_LANE else NOMINAL_WIDTH
         aside = 0.5 * width * _normals(self.lines[k])
         for tag, bound in (("leftBound", self.lines[k] + aside), ("rightBound", self.lines[k] - aside)):
-            side = ET.SubElement(node, tag)
+            side = _add(node, tag)
             for place in bound:
-                _point(side, place)
-        links = [("predecessor", a) for a, b in self.flow if b == k]
-        links += [("successor", b) for a, b in self.flow if a == k]
-        for tag, other in links:
-            ET.SubElement(node, tag, ref=str(self.ids[other]))
+                _point(side, "point", place)
+        for tag, others in (
+            ("predecessor", [a for a, b in self.flow if b == k]),
+            ("successor", [b for a, b in self.flow if a == k]),
+        ):
+            for other in others:
+                _add(node, tag, ref=self.ids[other])
         for tag, name in (("adjacentLeft", "left_neighbors"), ("adjacentRight", "right_neighbors")):
-            beside = [b for a, b in self._pairs(name) if a == k]
-            if beside:  # the format knows one on either side
-                ET.SubElement(node, tag, ref=str(self.ids[beside[0]]), drivingDir="same")
-        _text(node, "laneletType", _LANES.get(kind, "unknown"))
+            # The format knows one on either side.
+            for other in [b for a, b in self._pairs(name) if a == k][:1]:
+                _add(node, tag, ref=self.ids[other], drivingDir="same")
+        _add(node, "laneletType", _LANES.get(kind, "unknown"))
         for tag, number in refs:
-            ET.SubElement(node, tag, ref=str(number))
+            _add(node, tag, ref=number)
 
     def _turn(self, lane: int) -> str:
         heading = np.unwrap(np.arctan2(*np.diff(self.lines[lane], axis=0).T[::-1]))
@@ -207,18 +198,17 @@ class _Network:
         return "straight" if abs(turn) < STRAIGHT else "left" if turn > 0 else "right"
 
     def _light(self, root: ET.Element, number: int, light: int, turn: str) -> None:
-        node = ET.SubElement(root, "trafficLight", id=str(number))
-        cycle = ET.SubElement(node, "cycle")
+        node = _add(root, "trafficLight", id=number)
+        cycle = _add(node, "cycle")
         states = self.segment.signal_state[light, self.within].tolist()
         for color, run in groupby(_COLORS.get(SignalState(state), "inactive") for state in states):
-            element = ET.SubElement(cycle, "cycleElement")
-            _text(element, "duration", str(len(list(run))))
-            _text(element, "color", color)
-        _text(cycle, "timeOffset", "0")
-        place = self.segment.signal_point[light, :2] + self.segment.origin[:2]
-        _point(ET.SubElement(node, "position"), place)
-        _text(node, "direction", turn)
-        _text(node, "active", "true")
+            element = _add(cycle, "cycleElement")
+            _add(element, "duration", str(len(list(run))))
+            _add(element, "color", color)
+        _add(cycle, "timeOffset", "0")
+        _point(node, "position", self.segment.signal_point[light, :2] + self.segment.origin[:2])
+        _add(node, "direction", turn)
+        _add(node, "active", "true")
 
 
 def _normals(line: Reals) -> Reals:
@@ -234,54 +224,48 @@ def _normals(line: Reals) -> Reals:
 
 
 def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
-    """A rollout as JSON can hold it: agents with their states by step, lights, map, routes, events.
-
-    States are lists of step, x, y (m), heading (rad), speed (m/s).
+    """A rollout as JSON can hold it: agents with their states (step, x, y in metres, heading in radians, speed in
+    m/s), routes, and the steps of collisions and time off the road; lights; the map.
     """
-    segment, world = saved.segment, world_of(saved, rollout)
-    drivers = dict(zip(saved.agents.tolist(), saved.drivers, strict=True))
-    rank = {row: n for n, row in enumerate(saved.agents.tolist())}
-    place = world.position + segment.origin[:2]
-
-    def agent(row: int) -> dict[str, Any]:
-        steps = np.flatnonzero(world.valid[row]).tolist()
+    segment, world, origin = saved.segment, world_of(saved, rollout), saved.segment.origin[:2]
+    place = world.position + origin
+    within = slice(saved.start, saved.last + 1)
+    agents = []
+    for row in np.flatnonzero(world.valid.any(1)).tolist():
         values = np.column_stack([place[row], world.heading[row], world.speed[row]])
+        steps = np.flatnonzero(world.valid[row]).tolist()
         found = {
             "id": int(segment.agent_id[row]),
             "type": AgentType(segment.agent_type[row]).name.lower(),
             "length": float(segment.size[row, 0]),
             "width": float(segment.size[row, 1]),
             "ego": row == segment.ego,
-            "driver": drivers.get(row, PLAYBACK),
+            "driver": PLAYBACK,
             "states": [[step, *(round(value, 6) for value in values[step].tolist())] for step in steps],
         }
-        if row in rank:
-            n = rank[row]
-            route = saved.route(rollout, n)
-            found["route"] = None if route is None else (route + segment.origin[:2]).tolist()
+        for n in np.flatnonzero(saved.agents == row).tolist():
+            found["driver"], route = saved.drivers[n], saved.route(rollout, n)
+            found["route"] = None if route is None else (route + origin).tolist()
             for name in ("collision", "offroad"):
                 flags = getattr(saved, name)[rollout, :, n] & saved.counted[rollout, :, n]
                 found[name] = (1 + np.flatnonzero(flags)).tolist()
-        return found
+        agents.append(found)
 
     def lines(found: Polylines) -> list[Any]:
-        return [(found[k][:, :2] + segment.origin[:2]).tolist() for k in range(len(found))]
+        return [(found[k][:, :2] + origin).tolist() for k in range(len(found))]
 
-    within = slice(saved.start, saved.last + 1)
-    lights = zip(
-        segment.signal_lane.tolist(), segment.signal_point, segment.signal_state[:, within], strict=True
-    )
+    lights = zip(segment.signal_lane, segment.signal_point, segment.signal_state[:, within], strict=True)
     return {
         "segment": segment.segment_id,
         "rollout": rollout,
         "dt": float(segment.dt),
         "steps": saved.steps,
         "failed": saved.failed.get(rollout),
-        "agents": [agent(row) for row in np.flatnonzero(world.valid.any(1)).tolist()],
+        "agents": agents,
         "lights": [
             {
-                "lane": lane,
-                "stop": (point[:2] + segment.origin[:2]).tolist(),
+                "lane": int(lane),
+                "stop": (point[:2] + origin).tolist(),
                 "states": [SignalState(state).name.lower() for state in states],
             }
             for lane, point, states in lights

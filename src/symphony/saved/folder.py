@@ -9,49 +9,60 @@ import json
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from types import NoneType
 from typing import Any
 from urllib.parse import quote
 
-from safetensors.numpy import save
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
 
+from symphony.config.files import from_dict
+from symphony.data.segment import Polylines, RoadMap, RunSegment, validate
 from symphony.data.store import SegmentStore
-from symphony.errors import DataError
+from symphony.errors import ConfigError, DataError
 from symphony.files import Lock, naming, replacing, write_json
-from symphony.saved.rollouts import SavedRollouts
-from symphony.saved.tensors import KEY, MAX_LENGTH, read_tensors, tensors_of
+from symphony.saved.rollouts import SavedRollouts, SavedTrees
+
+KEY = "symphony"
+"""The name of the JSON in the header of a file."""
+MAX_STATE = {"x": 1e5, "y": 1e5, "heading": 1e4, "speed": 1e3}
+"""Metres, radians and m/s that a simulated state may have: some times those of a log, as nobody steers it back."""
+MAX_LENGTH = 100_000
+"""Rollouts, steps or agents."""
+
+_SCALARS = {
+    **dict.fromkeys(("segment_id", "source", "file", "group"), str),
+    **{"dt": float, "ego": int, "current_step": int},
+}
+# Types (b bool, f float32, i int64), and shapes by letter: K rollouts, N driven agents, T steps, U = T + 1; R trees,
+# S branches, P periods, L leaves.
+_TYPES = {"b": np.bool_, "f": np.float32, "i": np.int64}
+_SHAPES = {
+    **{"agents": "iN", "state": "fKUN4", "goal": "iKN"},
+    **dict.fromkeys(("counted", "collision", "offroad"), "bKTN"),
+}
+_TREE_SHAPES = {
+    **{"state": "fRSTN4", "score": "fRSTN", "totals": "fRPS", "parents": "iRPS", "slots": "iRPL"},
+    **dict.fromkeys(("there", "collision", "offroad"), "bRSTN"),
+}
 
 FORMAT = 1
 MANIFEST, INDEX, SEGMENTS = "manifest.json", "index.jsonl", "segments"
 LOCK = "rollouts.lock"
-"""Held by who writes."""
 LATER = ("weights", "specification", "planner", "planner_seconds")
 """Settings that a manifest has since November 2026."""
-_BEGUN = (LOCK, SEGMENTS, INDEX)
-"""Names in a folder whose writer died before there was a manifest."""
-_LONGEST = 120
-"""Letters of a file's name."""
-_MANIFEST_KINDS = {"agent": str, "seed": int, "drivers": dict, "settings": dict, "store": dict}
-_ENTRY_KINDS: dict[str, tuple[type, ...]] = {
-    **dict.fromkeys(("segment", "file", "sha256", "group"), (str,)),
-    "rollouts": (int,),
-    "dt": (int, float),
-    "failed": (str, NoneType),
-}
+_KINDS = {"agent": str, "seed": int, "drivers": dict, "settings": dict, "store": dict}
 
 
 @dataclass(frozen=True)
 class About:
-    """Facts that all rollouts of a folder have in common.
-
-    Attributes:
-        agent: name of what is evaluated.
-        seed: of everything drawn at random.
-        drivers: who drove whom, such as ``{"interactive": "bc", "others": "playback"}``.
-        settings: of the simulation, as JSON can hold them.
-        store: ``path`` and ``checksum`` of the run segments.
+    """Facts that all rollouts of a folder have in common: the name of what is evaluated, the seed of everything drawn
+    at random, who drove whom, such as ``{"interactive": "bc", "others": "playback"}``, the settings of the
+    simulation, as JSON can hold them, and ``path`` and ``checksum`` of the store of run segments.
     """
 
     agent: str
@@ -62,16 +73,10 @@ class About:
 
     @classmethod
     def of(cls, agent: str, store: SegmentStore, settings: Any, *, seed: int = 0, planner: str = "") -> About:
-        """The facts of rollouts of one agent beside log playback.
-
-        Args:
-            agent: its name.
-            store: the run segments.
-            settings: a dataclass such as :class:`symphony.config.EvaluateConfig`, or a dictionary.
-            seed: of everything drawn at random.
-            planner: of the ego, which the agent then does not drive.
+        """The facts of rollouts of one agent beside log playback, and of a planner of the ego, if there is one; the
+        settings are a dictionary or a dataclass.
         """
-        plain = dataclasses.asdict(settings) if dataclasses.is_dataclass(settings) else dict(settings)  # type: ignore[arg-type]
+        plain = dataclasses.asdict(settings) if dataclasses.is_dataclass(settings) else settings  # type: ignore[arg-type]
         drivers = {"interactive": agent, "others": "playback"}
         if planner:
             agent, drivers = f"{planner} among {agent}", {"ego": planner, **drivers}
@@ -82,9 +87,7 @@ class About:
 
 @dataclass(frozen=True)
 class Entry:
-    """One run segment of a folder; ``failed`` says why there are no rollouts of it, and is None else; then ``group``
-    is that of the segment, as no file tells.
-    """
+    """One run segment of a folder; ``failed`` says why there are no rollouts of it, with the group of the segment."""
 
     segment: str
     rollouts: int
@@ -95,14 +98,9 @@ class Entry:
     group: str = ""
 
 
-class RolloutWriter:
-    """Adds segments to a folder of rollouts; each is on record once :meth:`add` returns. One writer at a time.
-
-    A folder that the same simulation was being written to is continued.
-
-    Args:
-        path: the folder; made if it isn't there.
-        about: what the rollouts have in common.
+class RolloutWriter(AbstractContextManager["RolloutWriter"]):
+    """Adds segments to a folder of rollouts, which is made if it isn't there, and continued if the same simulation
+    was being written to it; each is on record once :meth:`add` returns. One writer at a time.
 
     Raises:
         DataError: the folder holds something else, or rollouts of another simulation, or another process writes it.
@@ -110,45 +108,44 @@ class RolloutWriter:
 
     def __init__(self, path: str | Path, about: About) -> None:
         self.path = Path(path)
-        foreign = DataError("not empty and no folder of rollouts: refusing to write into it", file=self.path)
-        known = (self.path / MANIFEST, self.path / LOCK)  # with a lock, that of one who has just begun
-        if self.path.exists() and any(self.path.iterdir()) and not any(path.exists() for path in known):
-            raise foreign
         with naming(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
+        # One who has just begun, or died then, has no manifest yet.
+        there = {held.name for held in self.path.iterdir()}
+        if there - {LOCK, SEGMENTS, INDEX} and MANIFEST not in there:
+            raise DataError("not empty and no folder of rollouts: refusing to write into it", file=self.path)
         self._lock = Lock(self.path / LOCK)
         try:
-            manifest = {"format": FORMAT, **dataclasses.asdict(about)}
-            changed = list(manifest)
-            if (self.path / MANIFEST).exists():
-                changed = _differing(manifest, _read_manifest(self.path))
-                # One that holds nothing yet is nobody's.
-                if changed and (_read_index(self.path) or any((self.path / SEGMENTS).glob("*"))):
-                    message = (
-                        f"holds the rollouts of another simulation, which differs in {', '.join(changed)}"
-                    )
-                    at = changed[0].partition(".")[0]
-                    raise DataError(message, file=self.path / MANIFEST, field=at)
-            elif any(path.name not in _BEGUN for path in self.path.iterdir()):
-                raise foreign
-            with naming(self.path):
-                (self.path / SEGMENTS).mkdir(exist_ok=True)
-                with (self.path / INDEX).open("ab+") as file:  # a line that was not finished is cut off
-                    file.seek(0)
-                    file.truncate(file.read().rfind(b"\n") + 1)
-            if changed:
-                write_json(self.path / MANIFEST, manifest)
-            self._entries = _read_index(self.path)
+            self._begin({"format": FORMAT, **dataclasses.asdict(about)})
         except BaseException:
             self.close()
             raise
 
+    def _begin(self, manifest: dict[str, Any]) -> None:
+        file, changed = self.path / MANIFEST, list(manifest)
+        if file.exists():
+            held = _read_manifest(self.path)
+            changed = [name for name in manifest if manifest[name] != held.get(name)]
+            if "settings" in changed and isinstance(held.get("settings"), dict):
+                now, before = manifest["settings"], held["settings"]
+                names = [name for name in {**now, **before} if now.get(name) != before.get(name)]
+                changed = [name for name in changed if name != "settings"] + [f"settings.{n}" for n in names]
+            # One that holds nothing yet is nobody's.
+            if changed and (_read_index(self.path) or any((self.path / SEGMENTS).glob("*"))):
+                message = f"holds the rollouts of another simulation, which differs in {', '.join(changed)}"
+                raise DataError(message, file=file, field=changed[0].partition(".")[0])
+        with naming(self.path):
+            (self.path / SEGMENTS).mkdir(exist_ok=True)
+            with (self.path / INDEX).open("ab+") as index:  # a line that was not finished is cut off
+                index.seek(0)
+                index.truncate(index.read().rfind(b"\n") + 1)
+        if changed:
+            write_json(file, manifest)
+        self._entries = _read_index(self.path)
+
     def close(self) -> None:
         """Let others write."""
         self._lock.close()
-
-    def __enter__(self) -> RolloutWriter:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -173,8 +170,7 @@ class RolloutWriter:
         read_tensors(data, self.path / file, name)
         with replacing(self.path / file) as draft:
             draft.write_bytes(data)
-        digest = hashlib.sha256(data).hexdigest()
-        self._record(Entry(name, saved.rollouts, file, digest, saved.segment.dt))
+        self._record(Entry(name, saved.rollouts, file, hashlib.sha256(data).hexdigest(), saved.segment.dt))
 
     def fail(self, segment_id: str, rollouts: int, reason: str, group: str = "") -> None:
         """Put on record that a segment could not be simulated; it is tried again when the folder is continued."""
@@ -182,11 +178,9 @@ class RolloutWriter:
 
     def _record(self, entry: Entry) -> None:
         self._lock.check()
-        path, given = self.path / INDEX, dataclasses.asdict(entry)
-        if not entry.group:
-            del given["group"]
-        if entry.failed is not None:
-            del given["dt"]
+        absent = {"" if entry.group else "group", "" if entry.failed is None else "dt"}
+        given = {name: value for name, value in vars(entry).items() if name not in absent}
+        path = self.path / INDEX
         with naming(path), path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(given, ensure_ascii=False) + "\n")
             file.flush()
@@ -194,22 +188,8 @@ class RolloutWriter:
         self._entries[entry.segment] = entry
 
 
-def _differing(mine: Mapping[str, Any], held: Mapping[str, Any]) -> list[str]:
-    """Names of what two manifests differ in; of their settings each."""
-    found = [name for name in mine if name != "settings" and mine[name] != held.get(name)]
-    now, before = mine["settings"], held.get("settings")
-    if not isinstance(before, dict):
-        return [*found, "settings"]
-    # Folders from before the later settings were kept don't say.
-    names = [name for name in dict.fromkeys([*now, *before]) if name not in LATER or name in before]
-    return found + [f"settings.{name}" for name in names if now.get(name) != before.get(name)]
-
-
 class RolloutFolder:
     """Read access to a folder of rollouts: ``folder[i]`` reads and checks that segment only.
-
-    Args:
-        path: the folder.
 
     Raises:
         DataError: no such folder, of another version, or damaged.
@@ -218,10 +198,10 @@ class RolloutFolder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         manifest = _read_manifest(self.path)
-        for name, kind in _MANIFEST_KINDS.items():
+        for name, kind in _KINDS.items():
             if type(manifest.get(name)) is not kind:
                 raise DataError(f"must be {kind.__name__}", file=self.path / MANIFEST, field=name)
-        self.about = About(**{name: manifest[name] for name in _MANIFEST_KINDS})
+        self.about = About(**{name: manifest[name] for name in _KINDS})
         found = _read_index(self.path).values()
         self.entries = [entry for entry in found if entry.failed is None]
         self.failures = [entry for entry in found if entry.failed is not None]
@@ -229,8 +209,9 @@ class RolloutFolder:
     def only(self, segments: Iterable[str]) -> RolloutFolder:
         """The folder with some of its segments only."""
         wanted, found = set(segments), copy.copy(self)
-        found.entries = [entry for entry in self.entries if entry.segment in wanted]
-        found.failures = [entry for entry in self.failures if entry.segment in wanted]
+        found.entries, found.failures = (
+            [entry for entry in kind if entry.segment in wanted] for kind in (self.entries, self.failures)
+        )
         return found
 
     def __len__(self) -> int:
@@ -246,11 +227,7 @@ class RolloutFolder:
             raise DataError(message, file=file, segment=segment) from error
         if hashlib.sha256(data).hexdigest() != entry.sha256:
             raise DataError("damaged: not what was written", file=file, segment=segment, field="sha256")
-        saved = read_tensors(data, file, segment)
-        if saved.rollouts != entry.rollouts:
-            message = f"holds {saved.rollouts} rollouts, the index says {entry.rollouts}"
-            raise DataError(message, file=file, segment=segment, field="state")
-        return saved
+        return read_tensors(data, file, segment)
 
     def __iter__(self) -> Iterator[SavedRollouts]:
         return (self[i] for i in range(len(self)))
@@ -261,27 +238,14 @@ class RolloutFolder:
         return [entry.segment for entry in self.entries]
 
     def of(self, segment_id: str) -> SavedRollouts:
-        """The rollouts of a segment, by its id.
-
-        Raises:
-            DataError: there are none.
-        """
+        """The rollouts of a segment, by its id; a DataError if there are none."""
         if segment_id not in self.ids:
             raise DataError("no rollouts of this segment", file=self.path, segment=segment_id)
         return self[self.ids.index(segment_id)]
 
 
 def save_rollouts(path: str | Path, about: About, found: Iterable[SavedRollouts]) -> RolloutFolder:
-    """Write rollouts to a folder; those of segments that are there already, from a run cut short, are passed over.
-
-    Args:
-        path: the folder.
-        about: what they have in common.
-        found: the rollouts of each segment.
-
-    Raises:
-        DataError: as :class:`RolloutWriter`.
-    """
+    """Write rollouts of segments by a :class:`RolloutWriter`; those that are there already are passed over."""
     with RolloutWriter(path, about) as writer:
         for saved in found:
             if not writer.has(saved.segment.segment_id):
@@ -290,20 +254,14 @@ def save_rollouts(path: str | Path, about: About, found: Iterable[SavedRollouts]
 
 
 def load_rollouts(path: str | Path) -> RolloutFolder:
-    """Open a folder of rollouts; each segment is checked as it is read.
-
-    Raises:
-        DataError: as :class:`RolloutFolder`.
-    """
+    """Open a folder of rollouts; each segment is checked as it is read."""
     return RolloutFolder(path)
 
 
 def file_stem(segment_id: str) -> str:
     """A name for files of a segment: safe on any system, another one for every segment."""
-    name = quote(segment_id, safe="")
-    if len(name) > _LONGEST:
-        name = f"{name[: _LONGEST - 17]}-{hashlib.sha256(segment_id.encode()).hexdigest()[:16]}"
-    return name
+    name, digest = quote(segment_id, safe=""), hashlib.sha256(segment_id.encode()).hexdigest()
+    return name if len(name) <= 120 else f"{name[:103]}-{digest[:16]}"
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
@@ -328,17 +286,171 @@ def _read_index(path: Path) -> dict[str, Entry]:
     found: dict[str, Entry] = {}
     for number, line in enumerate(lines, start=1):
         try:
-            entry = Entry(**json.loads(line))
-        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            entry = from_dict(Entry, json.loads(line))
+        except (ConfigError, ValueError, TypeError, RecursionError) as error:
             raise DataError(f"line {number} is damaged ({error})", file=file) from error
-        for name, kinds in _ENTRY_KINDS.items():
-            if type(getattr(entry, name)) not in kinds:
-                raise DataError(f"line {number}: of a wrong type", file=file, field=name)
-        if not 0 <= entry.rollouts <= MAX_LENGTH:
-            raise DataError(f"line {number}: {entry.rollouts} rollouts", file=file, field="rollouts")
         inside = entry.file.startswith(f"{SEGMENTS}/") and entry.file.count("/") == 1
-        if entry.failed is None and not (inside and entry.file.isprintable()):
-            raise DataError(f"line {number} names no file of this folder", file=file, segment=entry.segment)
+        named = entry.failed is not None or (inside and entry.file.isprintable())
+        if not named or not 0 <= entry.rollouts <= MAX_LENGTH:
+            wrong = f"{entry.rollouts} rollouts" if named else "names no file of this folder"
+            raise DataError(f"line {number}: {wrong}", file=file, segment=entry.segment)
         found.pop(entry.segment, None)
         found[entry.segment] = entry
     return found
+
+
+def tensors_of(saved: SavedRollouts) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """All arrays of a file by name, and what JSON holds beside them."""
+    segment, trees = saved.segment, saved.trees
+    arrays: dict[str, NDArray[Any]] = {}
+    for prefix, part in (("", saved), ("log.", segment), ("road.", segment.road), ("tree.", trees)):
+        for item in fields(part) if part is not None else ():
+            value, name = getattr(part, item.name), f"{prefix}{item.name}"
+            if isinstance(value, Polylines):
+                arrays |= {f"{name}.points": value.points, f"{name}.offsets": value.offsets}
+            elif isinstance(value, np.ndarray):
+                arrays[name] = value
+    facts: dict[str, Any] = {name: kind(getattr(segment, name)) for name, kind in _SCALARS.items()}
+    facts |= {"start": saved.start, "drivers": list(saved.drivers)}
+    facts["failed"] = {str(number): reason for number, reason in saved.failed.items()}
+    if trees is not None:
+        facts["prune_every"] = int(trees.prune_every)
+    # Only contiguous arrays are written as they are meant.
+    return {name: np.ascontiguousarray(value) for name, value in arrays.items()}, facts
+
+
+def read_tensors(data: bytes, file: Path, segment_id: str) -> SavedRollouts:
+    """Saved rollouts from the bytes of their file.
+
+    Raises:
+        DataError: damaged, something missing, of a wrong type or shape, not finite, or out of range; names the file,
+            the segment and the field.
+    """
+    try:
+        arrays = load(data)
+        # A safetensors file begins with the length of its header as 8 bytes.
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+        saved = _assembled(arrays, json.loads(header["__metadata__"][KEY]))
+        _check(saved, segment_id)
+        return saved
+    except DataError as error:
+        raise DataError(error.message, file=file, segment=segment_id, field=error.field) from error
+    except KeyError as error:
+        raise DataError("is missing", file=file, segment=segment_id, field=error.args[0]) from error
+    except (SafetensorError, ValueError, TypeError, RecursionError) as error:
+        raise DataError(f"damaged ({error})", file=file, segment=segment_id) from error
+
+
+def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedRollouts:
+    """Saved rollouts of arrays whose shapes are not checked yet."""
+    if "log_weight" in arrays:
+        message = "is of a search with a tilt, which needs these weights: simulate anew"
+        raise DataError(message, field="log_weight")
+    kinds = {**_SCALARS, "start": int, "drivers": list, "failed": dict}
+    for name, kind in (kinds | {"prune_every": int} if "prune_every" in facts else kinds).items():
+        if type(facts[name]) is not kind:
+            raise DataError(f"is {facts[name]!r:.80}, which is of the wrong type", field=name)
+    # Thousands of digits would be no number to Python either.
+    if not all(number.isascii() and number.isdigit() and len(number) < 10 for number in facts["failed"]):
+        raise DataError("must name rollouts by number", field="failed")
+    if not all(isinstance(name, str) for name in facts["drivers"]):
+        raise DataError("must be names", field="drivers")
+
+    def built(kind: type[Any], prefix: str, **held: Any) -> Any:
+        for item in fields(kind):
+            name = f"{prefix}{item.name}"
+            if item.type == "Polylines":
+                lines = held[item.name] = Polylines(arrays[f"{name}.points"], arrays[f"{name}.offsets"])
+                flat = lines.offsets.ndim == 1 and len(lines.offsets) > 0 and lines.points.ndim == 2
+                if not flat or lines.offsets.dtype != np.int64:
+                    raise DataError("must be points [P, 3] and int64 offsets", field=name)
+            elif item.name not in held and item.metadata.get("hashed", True):
+                held[item.name] = arrays[name]
+        return kind(**held)
+
+    trees = None
+    if "prune_every" in facts:
+        # Files of before November 23, 2026 don't say who is there.
+        arrays.setdefault("tree.there", np.ones(arrays["tree.offroad"].shape, np.bool_))
+        trees = built(SavedTrees, "tree.", prune_every=facts["prune_every"])
+    scalars = {name: facts[name] for name in _SCALARS}
+    return built(
+        SavedRollouts,
+        "",
+        segment=built(RunSegment, "log.", road=built(RoadMap, "road."), **scalars),
+        start=facts["start"],
+        drivers=tuple(facts["drivers"]),
+        failed={int(number): str(reason) for number, reason in facts["failed"].items()},
+        trees=trees,
+    )
+
+
+def _check(saved: SavedRollouts, segment_id: str) -> None:
+    segment, trees, routes = validate(saved.segment), saved.trees, saved.routes
+    size = {"4": 4}
+    for name, shape in _SHAPES.items():
+        _check_shape(name, getattr(saved, name), shape, size)
+    points, offsets = routes.points, routes.offsets
+    whole = offsets[0] == 0 and offsets[-1] == len(points)
+    whole &= bool((offsets[1:] >= offsets[:-1]).all())  # differences of damaged ones can overflow
+    outside = f"steps {saved.start} to {saved.last} are outside the {segment.num_steps} of the log"
+    demanded = [
+        ("segment_id", segment.segment_id == segment_id, f"is of segment {segment.segment_id}"),
+        ("state", size["U"] == size["T"] + 1, f"{size['U']} states for {size['T']} steps"),
+        ("agents", len(np.unique(saved.agents)) == len(saved.agents), "names an agent twice"),
+        (
+            "agents",
+            _inside(saved.agents, 0, segment.num_agents),
+            f"outside the {segment.num_agents} of the log",
+        ),
+        ("routes", whole, "offsets do not match the points"),
+        ("routes", points.dtype == np.float32 and points.shape[1:] == (3,), "must be float32 [P, 3]"),
+        ("routes", bool(np.isfinite(points).all()), "holds numbers that are not finite"),
+        ("goal", _inside(saved.goal, -1, len(routes)), f"outside the {len(routes)} routes"),
+        ("start", saved.start >= 0 and saved.last < segment.num_steps, outside),
+        ("drivers", len(saved.drivers) == size["N"], f"{len(saved.drivers)} for {size['N']} agents"),
+        ("failed", all(k < size["K"] for k in saved.failed), f"names a rollout outside the {size['K']}"),
+    ]
+    states = {"state": saved.state[saved.there]} if all(good for _, good, _ in demanded) else {}
+    if trees is not None:
+        for name, shape in _TREE_SHAPES.items():
+            _check_shape(f"tree.{name}", getattr(trees, name), shape, size)
+        every, slots = trees.prune_every, f"outside the {size['S']} branches"
+        periods = f"{size['P']} periods of {every} for {size['T']} steps"
+        leaves = f"{size['R']} trees of {size['L']} leaves are not {size['K']} rollouts"
+        demanded += [
+            ("tree.prune_every", every > 0 and size["P"] == -(-size["T"] // max(every, 1)), periods),
+            ("tree.slots", size["R"] * size["L"] == size["K"], leaves),
+            ("tree.parents", _inside(trees.parents, 0, size["S"]), slots),
+            ("tree.slots", _inside(trees.slots, 0, size["S"]), slots),
+            ("tree.score", not np.isinf(trees.score).any(), "holds an infinite number"),
+        ]
+        states["tree.state"] = trees.state[trees.there]
+    for name, good, message in demanded:
+        if not good:
+            raise DataError(message, field=name)
+    for name, values in states.items():
+        if not np.isfinite(values).all():
+            raise DataError("holds numbers that are not finite", field=name)
+        far = np.abs(values).max(0, initial=0)
+        for (what, bound), found in zip(MAX_STATE.items(), far.tolist(), strict=True):
+            if found > bound:
+                raise DataError(f"a {what} of {found:.4g}, at most {bound:g} is plausible", field=name)
+
+
+def _check_shape(name: str, value: NDArray[Any], wanted: str, size: dict[str, int]) -> None:
+    """Check type and shape; a letter that is new takes the size it meets."""
+    dtype, shape = _TYPES[wanted[0]], wanted[1:]
+    if value.dtype != dtype:
+        raise DataError(f"dtype {value.dtype}, expected {np.dtype(dtype)}", field=name)
+    if value.ndim != len(shape) or max(value.shape) > MAX_LENGTH:  # arrays without elements have any shape
+        message = f"shape {list(value.shape)}, expected {len(shape)} dimensions of at most {MAX_LENGTH}"
+        raise DataError(message, field=name)
+    for letter, length in zip(shape, value.shape, strict=True):
+        if size.setdefault(letter, length) != length:
+            message = f"shape {list(value.shape)}: {length} where {size[letter]} is expected"
+            raise DataError(message, field=name)
+
+
+def _inside(values: NDArray[Any], low: int, high: int) -> bool:
+    return not values.size or (values.min() >= low and values.max() < high)

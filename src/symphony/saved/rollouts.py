@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,16 +58,6 @@ class SavedTrees:
     slots: NDArray[np.int64]
     prune_every: int
 
-    @property
-    def reaches_leaf(self) -> NDArray[np.bool_]:
-        """[R, P, S] whether what a slot simulated in a period is part of the history of a leaf."""
-        return (self.slots[..., None] == np.arange(self.parents.shape[-1])).any(-2)
-
-    @property
-    def copies(self) -> NDArray[np.int64]:
-        """[R, P, S] how many slots were continued from what each slot simulated in a period."""
-        return (self.parents[..., None] == np.arange(self.parents.shape[-1])).sum(-2)
-
 
 @dataclass(frozen=True)
 class SavedRollouts:
@@ -103,10 +93,8 @@ class SavedRollouts:
 
     @property
     def there(self) -> NDArray[np.bool_]:
-        """[K, T + 1, N] which agents are there at each state.
-
-        At the first one where the second counts and the log has them, too: who enters with the first step was not
-        there before.
+        """[K, T + 1, N] which agents are there at each state: at the first one where the second counts and the log
+        has them, too, as who enters with the first step was not there before.
         """
         first = self.counted[:, :1] & self.segment.valid[self.agents, self.start]
         return np.concatenate([first, self.counted], 1)
@@ -143,6 +131,54 @@ class SavedRollouts:
         return None if number < 0 else self.routes[number][:, :2]
 
 
+class World(NamedTuple):
+    """Everyone in one rollout. Legend: A agents, U states.
+
+    Attributes:
+        position: [A, U, 2].
+        heading: [A, U].
+        velocity: [A, U, 2].
+        valid: [A, U].
+        size: [A, 2] length, width.
+        height: [A, U, 2] height and level, see :mod:`symphony.data.levels`; None where the map has no levels.
+    """
+
+    position: NDArray[np.float64]
+    heading: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    size: NDArray[np.float64]
+    height: NDArray[np.float32] | None = None
+
+    @property
+    def speed(self) -> NDArray[np.float64]:
+        """[A, U] along the heading, negative when reversing."""
+        return self.velocity[..., 0] * np.cos(self.heading) + self.velocity[..., 1] * np.sin(self.heading)
+
+
+def world_of(saved: SavedRollouts, rollout: int) -> World:
+    """Everyone in one rollout: driven agents where they were driven, all others as logged."""
+    segment, agents, within = saved.segment, saved.agents, slice(saved.start, saved.last + 1)
+    position, heading, velocity = (
+        part[:, within].astype(np.float64)
+        for part in (segment.position[..., :2], segment.heading, segment.velocity)
+    )
+    valid, there = segment.valid[:, within].copy(), saved.there[rollout].T
+    state = np.where(there[..., None], saved.state[rollout].swapaxes(0, 1), 0).astype(np.float64)
+    direction = np.stack([np.cos(state[..., 2]), np.sin(state[..., 2])], -1)
+    position[agents], heading[agents] = state[..., :2], state[..., 2]
+    velocity[agents], valid[agents] = state[..., 3:] * direction, there
+    height = None
+    if len(saved.log_height):
+        # Of driven agents those of the nearest places of their logs.
+        place = saved.state[rollout].swapaxes(0, 1)[:, :, None, :2]
+        away = np.square(segment.position[agents][:, None, :, :2] - place).sum(-1)
+        step = np.where(segment.valid[agents][:, None], away, np.inf).argmin(-1)
+        height = saved.log_height[within].swapaxes(0, 1).copy()
+        height[agents] = saved.log_height[step, agents[:, None]]
+    return World(position, heading, velocity, valid, segment.size[:, :2].astype(np.float64), height)
+
+
 def saved_rollouts(
     segment: RunSegment,
     scenes: SceneBatch,
@@ -155,27 +191,19 @@ def saved_rollouts(
     others: str = "",
     failed: Mapping[int, str] | None = None,
 ) -> SavedRollouts:
-    """Rollouts of one run segment, ready to be written.
+    """The rollouts [B, K, ...] of one run segment, in a row of B scenes, ready to be written.
 
-    Args:
-        segment: in row ``row`` of the scenes.
-        scenes: that were simulated.
-        rollouts: [B, K, ...] of them.
-        row: of the batch.
-        goal: [B, K, N] number of the route that each agent followed among its feasible ones, -1 for none.
-        search: of which the rollouts are the leaves, with leading dimensions [B, R] and its tree kept.
-        driver: of all interactive agents, or of each [N].
-        others: what drives background agents.
-        failed: see :class:`SavedRollouts`.
+    Beside them the numbers [B, K, N] of the routes that agents followed, -1 for none; a search, [B, R], of which they
+    are the leaves, with its tree kept; the driver of all interactive agents, or of each; what drives background
+    agents; and why rollouts failed, by their numbers.
     """
-    real = scenes.interactive_valid[row].cpu().numpy()
+    real, background = (_array(part[row]) for part in (scenes.interactive_valid, scenes.background))
     steps = min(segment.num_steps - 1, rollouts.collision.shape[-2])
-    counted, collision, offroad = (
+    collision, offroad, counted = (
         _array(part[row])[:, :steps, real]
-        for part in (rollouts.counted, rollouts.collision, rollouts.offroad)
+        for part in (rollouts.collision, rollouts.offroad, rollouts.counted)
     )
-    names = [driver] * len(real) if isinstance(driver, str) else list(driver)
-    background = scenes.background[row].tolist()
+    names = [driver] * len(real) if isinstance(driver, str) else driver
     names = [BACKGROUND + others if rule else name for name, rule in zip(names, background, strict=True)]
     number, routes = _routes(scenes, row, goal, len(counted))
     return SavedRollouts(
@@ -222,15 +250,9 @@ def _trees(search: BeamSearchResult, row: int, steps: int, real: NDArray[np.bool
         for key in (keys.STATE, keys.VALID, keys.COLLISION, keys.OFFROAD)
     )
     periods = math.ceil(steps / search.prune_every)
-    totals, parents = (_array(part[row])[:, :periods] for part in (search.totals, search.parents))
-    return SavedTrees(
-        state=state,
-        there=there,
-        collision=collision[..., 0],
-        offroad=offroad[..., 0],
-        score=_array(search.simulated_scores[row])[:, :, :steps, real],
-        totals=totals,
-        parents=parents,
-        slots=_array(search.slots[row])[:, :periods],
-        prune_every=search.prune_every,
+    totals, parents, slots = (
+        _array(part[row])[:, :periods] for part in (search.totals, search.parents, search.slots)
     )
+    score = _array(search.simulated_scores[row])[:, :, :steps, real]
+    hit, off = collision[..., 0], offroad[..., 0]
+    return SavedTrees(state, there, hit, off, score, totals, parents, slots, search.prune_every)

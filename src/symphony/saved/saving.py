@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +19,12 @@ from symphony.errors import DataError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.planners.calls import SECONDS
 from symphony.planners.driver import EgoPlanners
+from symphony.planners.identity import source_of
 from symphony.planners.interface import planner_maker, planner_name
 from symphony.rollouts.control import given_goals
 from symphony.rollouts.driving import beside_planner, simulate_batch
-from symphony.rollouts.finite import NotFiniteError
 from symphony.rollouts.workers import batches, naming, segments_together, shared
 from symphony.saved.folder import About, RolloutFolder, RolloutWriter
-from symphony.saved.identity import identity_of, source_of
 from symphony.saved.rollouts import PLAYBACK, SavedRollouts, saved_rollouts
 
 _MEMORY = ("batch", "device", "metric", "workers", "engine")
@@ -42,23 +43,23 @@ def save_simulation(
     planner: str | Callable[..., Any] = "",
     planner_seconds: float = SECONDS,
     goals: Sequence[str] = (),
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RolloutFolder:
-    """Simulate an agent on every run segment of a dataset and keep the rollouts, segment by segment.
+    """Simulate an agent on every run segment of a dataset, which has routes if there are goals or a planner, and keep
+    the rollouts in a folder, segment by segment.
 
     What was cut short goes on where it stopped: rollouts depend on the seed and the segment, not on the batch.
 
     Args:
         path: the folder.
         agent: on ``config.device``; log playback is kept as it is.
-        dataset: in the agent's action space, with routes if it follows goals.
+        dataset: in the agent's action space.
         config: how it is simulated; with a planner without a search unless one is asked for.
         keep_tree: of a search keep all branches with their scores, too.
-        planner: of the ego, or its name, as of :func:`symphony.planners.interface.planner_maker`; then the dataset
-            holds routes and the agent drives the other interactive agents. Segments whose ego can't be driven are put
-            on record as failed.
+        planner: of the ego, or its name, as of :func:`symphony.planners.interface.planner_maker`; the agent drives
+            the other interactive agents. Segments whose ego can't be driven are put on record as failed.
         planner_seconds: that it has for one answer; more fails the run.
-        goals: of agents, as :func:`symphony.rollouts.control.given_goals` reads them; then the dataset has routes.
+        goals: of agents, as :func:`symphony.rollouts.control.given_goals` reads them.
         progress: called with the segments done and their total.
 
     Raises:
@@ -69,7 +70,7 @@ def save_simulation(
     if planner:
         planner_maker(planner)  # or complain before anything is simulated
         config = beside_planner(config)
-    settings = plain_settings(config, dataset.interactive, dataset.duration) | identity_of(agent)
+    settings = plain_settings(config, agent, dataset.interactive, dataset.duration)
     if goals:
         settings["goal"] = list(goals)
     if planner:
@@ -82,7 +83,7 @@ def save_simulation(
         if planner:
             todo = [i for i in todo if _has_ego(writer, dataset, i, config.rollouts)]
         done = len(names) - len(todo)
-        drive = _Drive(agent, dataset, config, keep_tree, planner, planner_seconds, tuple(goals))
+        drive = partial(_drive, agent, dataset, config, keep_tree, planner, planner_seconds, tuple(goals))
         together = segments_together(agent, config, dataset.interactive)
         if planner and not config.batch:
             together = min(together, PLANNED)
@@ -91,58 +92,47 @@ def save_simulation(
                 for one in saved:
                     writer.add(one)
                 done += len(saved)
-                if progress is not None:
-                    progress(done, len(names))
+                progress(done, len(names))
     return RolloutFolder(path)
 
 
-@dataclass(frozen=True)
-class _Drive:
-    """Simulates an agent on a batch of run segments, and a planner as the ego if one is named."""
-
-    agent: Agent
-    dataset: SceneDataset
-    config: EvaluateConfig
-    keep_tree: bool
-    planner: str | Callable[..., Any]
-    planner_seconds: float
-    goals: tuple[str, ...]
-
-    def __call__(self, items: list[int]) -> list[SavedRollouts]:
-        """Rollouts of each segment."""
-        agent, config = self.agent, self.config
-        with naming(self.dataset, items):
-            scenes = self.dataset.scenes(items).to(torch.device(config.device))
-            segments = [self.dataset.segment(i) for i in items]
-            driver: str | list[str] = PLAYBACK if agent.policy is None else agent.name
-            egos = given = None
-            if self.planner:
-                name, make = planner_name(self.planner), planner_maker(self.planner)
-                egos = EgoPlanners(name, make, segments, self.planner_seconds)
-                driver = [name, *[str(driver)] * (scenes.interactive.shape[1] - 1)]
-            if self.goals:
-                given = given_goals(self.goals, segments, scenes, planned=bool(self.planner))
-            try:
-                found = simulate_batch(
-                    agent, scenes, config, keep_tree=self.keep_tree, egos=egos, given=given
-                )
-            except NotFiniteError as error:
-                raise error.named(segments[error.row].segment_id) from error
-            rollouts, on_cpu = found.rollouts.cpu(), scenes.cpu()
-            return [
-                saved_rollouts(
-                    segment,
-                    on_cpu,
-                    rollouts,
-                    b,
-                    goal=found.goal,
-                    search=found.search if self.keep_tree else None,
-                    driver=driver,
-                    others=config.others,
-                    failed=found.failed[b] if found.failed else None,
-                )
-                for b, segment in enumerate(segments)
-            ]
+def _drive(
+    agent: Agent,
+    dataset: SceneDataset,
+    config: EvaluateConfig,
+    keep_tree: bool,
+    planner: str | Callable[..., Any],
+    planner_seconds: float,
+    goals: Sequence[str],
+    items: list[int],
+) -> list[SavedRollouts]:
+    """Rollouts of an agent on a batch of run segments, of each, with a planner as the ego if one is named."""
+    with naming(dataset, items):
+        scenes = dataset.scenes(items).to(torch.device(config.device))
+        segments = [dataset.segment(i) for i in items]
+        drivers = [PLAYBACK if agent.policy is None else agent.name] * scenes.interactive.shape[1]
+        egos = given = None
+        if planner:
+            drivers[0] = planner_name(planner)
+            egos = EgoPlanners(drivers[0], planner_maker(planner), segments, planner_seconds)
+        if goals:
+            given = given_goals(goals, segments, scenes, planned=bool(planner))
+        found = simulate_batch(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
+        rollouts, on_cpu = found.rollouts.cpu(), scenes.cpu()
+        return [
+            saved_rollouts(
+                segment,
+                on_cpu,
+                rollouts,
+                b,
+                goal=found.goal,
+                search=found.search if keep_tree else None,
+                driver=drivers,
+                others=config.others,
+                failed=found.failed[b] if found.failed else None,
+            )
+            for b, segment in enumerate(segments)
+        ]
 
 
 def _has_ego(writer: RolloutWriter, dataset: SceneDataset, item: int, rollouts: int) -> bool:
@@ -157,8 +147,20 @@ def _has_ego(writer: RolloutWriter, dataset: SceneDataset, item: int, rollouts: 
     return False
 
 
-def plain_settings(config: EvaluateConfig, interactive: int, duration: float) -> dict[str, Any]:
-    """Settings that change what is simulated, with the agent's own where the configuration leaves them to it."""
+def plain_settings(config: EvaluateConfig, agent: Agent, interactive: int, duration: float) -> dict[str, Any]:
+    """Settings that change what is simulated, with the agent's own where the configuration leaves them to it, and
+    digests of its weights and of what it is built and searched by.
+    """
     found = dataclasses.asdict(config)
     found |= {"interactive": config.interactive or interactive, "duration": config.duration or duration}
-    return {name: value for name, value in found.items() if name not in _MEMORY}
+    found = {name: value for name, value in found.items() if name not in _MEMORY}
+    if not agent.modules:
+        return found
+    weights = hashlib.sha256()
+    for part, module in sorted(agent.modules.items()):
+        for name, value in sorted(module.state_dict().items()):
+            weights.update(f"{part}.{name} {value.dtype} {tuple(value.shape)}".encode())
+            weights.update(value.detach().cpu().contiguous().numpy().tobytes())
+    text = "" if agent.spec is None else json.dumps(dataclasses.asdict(agent.spec), sort_keys=True)
+    built = hashlib.sha256(text.encode()).hexdigest()[:12]
+    return found | {"weights": weights.hexdigest()[:12], "specification": built}

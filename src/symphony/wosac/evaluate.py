@@ -41,12 +41,8 @@ vehicles that act at random."""
 
 
 class SegmentResult(NamedTuple):
-    """What was found of an agent on a run segment.
-
-    Attributes:
-        scores: see :func:`symphony.wosac.scorer.score`.
-        passing: who goes first there.
-        seconds: CPU time of the simulation.
+    """What was found of an agent on a run segment: its scores (see :func:`symphony.wosac.scorer.score`), who goes
+    first there, and CPU seconds of the simulation.
     """
 
     scores: dict[str, float]
@@ -123,15 +119,9 @@ class WosacEvaluation:
 
 
 def wosac_parts(found: WosacEvaluation, record: Mapping[str, Any]) -> dict[str, Any]:
-    """What the score adds to the record of an evaluation (see :mod:`symphony.evaluation.records`).
-
-    Args:
-        found: of the same agent on the same store.
-        record: the evaluation.
-
-    Returns:
-        ``wosac``: all of it; the numbers of the agent with ``wosac_`` before their names, and the parts of the
-        baselines with theirs.
+    """What the score adds to the record of an evaluation of the same agent on the same store (see
+    :mod:`symphony.evaluation.records`): ``wosac``, all of it; the numbers of the agent with ``wosac_`` before their
+    names, and the parts of the baselines with theirs.
     """
 
     def named(agent: str) -> dict[str, Any]:

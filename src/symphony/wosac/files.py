@@ -57,14 +57,7 @@ def read_rollouts(file: Path) -> SimulatedRollouts:
 
 @dataclass(frozen=True)
 class ScoreFile:
-    """Scores one scenario by its rollouts.
-
-    Attributes:
-        config: year of the challenge.
-        per_object: with the scores of each object.
-        features: folder to write the scenario's features to.
-        strict: a scenario that can't be scored is an error.
-    """
+    """Scores one scenario by its rollouts, with settings of :func:`score_files`."""
 
     config: str
     per_object: bool

@@ -3,7 +3,7 @@
 Nothing of the log after the current step is used: only agents that are valid then take part, and lights keep the
 latest state seen up to then. The learned agent drives all vehicles, however few it was trained to drive. Those that
 stand stay, and people walk on; whoever drives sees the latter at constant velocity. See
-:mod:`symphony.rollouts.bystanders`.
+:mod:`symphony.wosac.bystanders`.
 
 Legend: n agents valid at the current step, N vehicles among them, R rollouts, F future steps (80), U decisions and
 the first state.
@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +32,17 @@ from symphony.envs.routes import route_table
 from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
 from symphony.roadgraph import LaneGraph
-from symphony.rollouts.bystanders import standing, walks
 from symphony.rollouts.driving import simulation
-from symphony.rollouts.finite import NotFiniteError
+from symphony.rollouts.unroll import NotFiniteError
 from symphony.rollouts.workers import shared
+from symphony.wosac.bystanders import standing, walks
 from symphony.wosac.records import parse_scenario, read_scenarios
 from symphony.wosac.scorer import SimulatedRollouts
 from symphony.wosac.scorer.config import CURRENT, DT, FUTURE, ROLLOUTS
 from symphony.wosac.scorer.scenario import STATES
 
 Doubles = NDArray[np.float64]
+_TIMED = ("position", "heading", "velocity", "valid")
 
 AT_ONCE = 1600
 """Observations made at a time in a search, 0.1 MB each."""
@@ -52,14 +53,8 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings) -
 
     Between the agent's decisions positions are interpolated linearly and headings along the shorter arc; z is held.
 
-    Args:
-        agent: drives the vehicles.
-        segment: with steps of 0.1 s; what lies behind its current step, 10, is not looked at, but for the routes
-            where they are the log's.
-        settings: how the agent is simulated.
-
-    Returns:
-        World frame of the log, headings in [-π, π).
+    They are in the world frame of the log, headings in [-π, π). Of the segment, with steps of 0.1 s, what lies behind
+    its current step, 10, is not looked at, but for the routes where they are the log's.
 
     Raises:
         ConfigError: the agent is log playback, or can't search as asked for.
@@ -104,39 +99,30 @@ def simulated_scenarios(
     Raises:
         DataError: a record can't be used; names file, scenario and field.
     """
-    with closing(
-        shared(_Simulation(agent, settings), read_scenarios(data), settings.config(1, 0))
-    ) as results:
+    work = partial(_simulated, agent, settings)
+    with closing(shared(work, read_scenarios(data), settings.config(1, 0))) as results:
         for done, found in enumerate(results, 1):
             yield found
             progress(done)
 
 
-@dataclass(frozen=True)
-class _Simulation:
-    """Simulates a packed scenario."""
-
-    agent: Agent
-    settings: WosacSettings
-
-    def __call__(self, packed: tuple[Path, int, bytes]) -> tuple[str, SimulatedRollouts]:
-        """The id and the rollouts."""
-        file, record, payload = packed
-        scenario = parse_scenario(payload, file, record)
-        try:
-            whole = scenario_to_segment(scenario, file=file.name)
-            found = wosac_rollouts(self.agent, validate(mended(whole)), self.settings)
-            return scenario.scenario_id, with_the_rest(found, whole)
-        except DataError as error:
-            raise error.at(file=file, segment=scenario.scenario_id) from None
+def _simulated(
+    agent: Agent, settings: WosacSettings, packed: tuple[Path, int, bytes]
+) -> tuple[str, SimulatedRollouts]:
+    """The id and the rollouts of a packed scenario."""
+    file, record, payload = packed
+    scenario = parse_scenario(payload, file, record)
+    try:
+        whole = scenario_to_segment(scenario, file=file.name)
+        found = wosac_rollouts(agent, validate(mended(whole)), settings)
+        return scenario.scenario_id, with_the_rest(found, whole)
+    except DataError as error:
+        raise error.at(file=file, segment=scenario.scenario_id) from None
 
 
 def with_the_rest(found: SimulatedRollouts, segment: RunSegment) -> SimulatedRollouts:
-    """Rollouts with those of the agents that were left out of them as odd: a submission must hold everyone.
-
-    Args:
-        found: rollouts of some agents.
-        segment: all agents; the others go on at their velocity.
+    """Rollouts of everyone in a segment, as a submission must hold them: agents that were left out as odd go on at
+    their velocity.
 
     Raises:
         DataError: a state of theirs at the current step is not finite.
@@ -154,13 +140,8 @@ def with_the_rest(found: SimulatedRollouts, segment: RunSegment) -> SimulatedRol
 
 
 def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSegment:
-    """What a simulator may know, as a segment to drive in: it begins with the current step, all agents that are
-    valid then go on at constant velocity, and lights keep their latest state.
-
-    Args:
-        segment: see :func:`wosac_rollouts`.
-        dt: seconds between its steps.
-        future: steps of 0.1 s that it lasts.
+    """What a simulator may know, as a segment to drive in, with steps of ``dt`` seconds: it begins with the current
+    step, all agents that are valid then go on at constant velocity, and lights keep their latest state.
     """
     rows, now = _present(segment), segment.current_step
     steps = math.ceil(future * DT / dt - 1e-6) + 1
@@ -185,9 +166,7 @@ def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSeg
 def future_log(segment: RunSegment) -> RunSegment:
     """What became of those who are valid at the current step, from it on, in the rows of :func:`history_only`."""
     rows, now = _present(segment), segment.current_step
-    states = {
-        name: getattr(segment, name)[rows, now:] for name in ("position", "heading", "velocity", "valid")
-    }
+    states = {name: getattr(segment, name)[rows, now:] for name in _TIMED}
     return _from_now_on(segment, rows, signal_state=segment.signal_state[:, now:], **states)
 
 
@@ -237,7 +216,7 @@ def _driven(
     start: RunSegment,
     vehicles: NDArray[np.int64],
     settings: WosacSettings,
-    log: RunSegment | None = None,
+    log: RunSegment | None,
 ) -> Doubles:
     """[R, U, N, 3] x, y, heading of the vehicles; on the routes of the log, where there is one."""
     graph = LaneGraph(start.road) if agent.routed else None

@@ -180,12 +180,8 @@ def scenario_message(scenario_id: str, rollouts: SimulatedRollouts) -> pb.Scenar
 
 @dataclass
 class Report:
-    """What was found in a submission.
-
-    Attributes:
-        problems: what a server would refuse, naming shard, scenario, agent and field; the first of each scenario.
-        shards: names of those that were read.
-        scenarios: ids of the scenarios in it.
+    """What was found in a submission: what a server would refuse, naming shard, scenario, agent and field, the first
+    of each scenario; the names of its shards and the ids of its scenarios.
     """
 
     problems: list[DataError] = default(default_factory=list)
@@ -194,10 +190,8 @@ class Report:
 
 
 def required_agents(path: Path) -> dict[str, list[int]]:
-    """The agents that each scenario's rollouts must hold, by scenario id.
-
-    Args:
-        path: file, folder or pattern of WOMD scenario files; those of the test set will do.
+    """The agents that each scenario's rollouts must hold, by scenario id, from WOMD scenario files (see
+    :func:`symphony.wosac.records.read_scenarios`); those of the test set will do.
 
     Raises:
         DataError: a file or record can't be used; names it.

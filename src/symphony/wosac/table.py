@@ -54,12 +54,8 @@ def read_wosac(file: Path) -> dict[str, Any]:
 
 
 def wosac_table(records: Sequence[dict[str, Any]], names: Sequence[str] = ()) -> str:
-    """A table in Markdown: the baselines of the first record that has them, a line for the agent of each record, and
-    what the table is of.
-
-    Args:
-        records: see :func:`read_wosac`.
-        names: of the agents; by default what the records call them, and how they were simulated.
+    """A table in Markdown: the baselines of the first record that has them, a line for the agent of each record, by
+    its name or what the record calls it and how it was simulated, and what the table is of.
 
     Raises:
         ConfigError: of different run segments, years or horizons, or not a name for each.

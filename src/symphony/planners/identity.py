@@ -1,11 +1,9 @@
-"""Who drives, as digests: another agent or planner of the same name is another simulation."""
+"""Planners as digests: another one of the same name is another simulation."""
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import inspect
-import json
 import re
 import shlex
 from collections.abc import Callable, Mapping, Set
@@ -16,25 +14,11 @@ from typing import Any
 import numpy as np
 from torch import Tensor, nn
 
-from symphony.agents import Agent
 from symphony.planners.interface import PIPE, planner_maker
 from symphony.planners.view import FunctionPlanner
 
 _PLACE = re.compile(" at 0x[0-9A-Fa-f]+")
 """The place of an object in memory, in what Python prints of it."""
-
-
-def identity_of(agent: Agent) -> dict[str, str]:
-    """Digests of an agent's weights and of what it is built and searched by, as settings."""
-    if not agent.modules:
-        return {}
-    digest = hashlib.sha256()
-    for part, module in sorted(agent.modules.items()):
-        for name, value in sorted(module.state_dict().items()):
-            digest.update(f"{part}.{name} {value.dtype} {tuple(value.shape)}".encode())
-            digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    specification = "" if agent.spec is None else json.dumps(dataclasses.asdict(agent.spec), sort_keys=True)
-    return {"weights": digest.hexdigest()[:12], "specification": _short(specification.encode())}
 
 
 def source_of(planner: str | Callable[..., Any]) -> str:

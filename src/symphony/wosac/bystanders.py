@@ -52,13 +52,6 @@ def walks(
 
     They keep their velocity, each rollout with a pace and a course of its own, and their headings change as they did
     at some step of the last second, drawn anew for each step.
-
-    Args:
-        segment: with its current step.
-        rows: n of its agents.
-        rollouts: R.
-        steps: F, of the segment's time step.
-        seed: of everything drawn at random.
     """
     now = segment.current_step
     stream = fold_in(torch.tensor(stream_of(segment.segment_id)), Stream.WALKS)
