@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -11,9 +12,14 @@ from symphony.agents import Agent, build_agent
 from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
 
 
-def make_agent(space: Any = "bicycle", cells: int = 0) -> Agent:
-    """Untrained, with goals and a discriminator; a fifth of the time of one that comes with the package."""
-    torch.manual_seed(0)
+def make_agent(
+    space: Any = "bicycle", cells: int = 0, seed: int = 0, search: Any = (), **changes: Any
+) -> Agent:
+    """Untrained, with goals and a discriminator; a fifth of the time of one that comes with the package.
+
+    The search has settings of its own, and so has all else of the specification.
+    """
+    torch.manual_seed(seed)
     spec = AgentSpec(
         action_space=space,
         dt=0.2,
@@ -21,9 +27,9 @@ def make_agent(space: Any = "bicycle", cells: int = 0) -> Agent:
         agent=AgentConfig(num_points=12, hidden=8, cells=cells),
         discriminator=DiscriminatorConfig(hidden=8),
         searches=True,
-        search=SearchConfig(test_branches=2, prune_every=3),
+        search=SearchConfig(**{"test_branches": 2, "prune_every": 3, **dict(search)}),
     )
-    return build_agent("tiny", spec)
+    return build_agent("tiny", replace(spec, **changes))
 
 
 small = cache(make_agent)

@@ -23,17 +23,15 @@ AGENT = "pretrained:bc_ts_h"
 def played(segment: RunSegment, agents: Any = (0,), rollouts: int = 1, **changes: Any) -> SavedRollouts:
     """The log itself, as if it had been simulated; any field by name."""
     rows = np.asarray(agents, np.int64)
-    steps = segment.num_steps - 1
-    velocity, heading = segment.velocity[rows], segment.heading[rows]
+    velocity, heading, valid = (getattr(segment, name)[rows] for name in ("velocity", "heading", "valid"))
     speed = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
     state = np.concatenate([segment.position[rows, :, :2], heading[..., None], speed[..., None]], -1)
-    state = np.repeat(state.swapaxes(0, 1)[None], rollouts, 0).astype(np.float32)
-    shape = (rollouts, steps, len(rows))
+    shape = (rollouts, segment.num_steps - 1, len(rows))
     values: dict[str, Any] = {
         "segment": segment,
         "agents": rows,
-        "state": state,
-        "counted": np.repeat(segment.valid[rows].T[None, 1:] & segment.valid[rows].T[None, :-1], rollouts, 0),
+        "state": np.repeat(state.swapaxes(0, 1)[None], rollouts, 0).astype(np.float32),
+        "counted": np.repeat(valid.T[None, 1:] & valid.T[None, :-1], rollouts, 0),
         "collision": np.zeros(shape, bool),
         "offroad": np.zeros(shape, bool),
         "goal": np.full((rollouts, len(rows)), -1, np.int64),
@@ -61,31 +59,19 @@ def random_trees(saved: SavedRollouts, branches: int = 4, every: int = 2, seed: 
     )
 
 
+@lru_cache
 def searched(
     count: int = 2, rollouts: int = 4, branches: int = 6, duration: int = 4
 ) -> tuple[About, list[SavedRollouts]]:
     """Rollouts of the included agent, leaves of one search each, on the first built-in test segments."""
-    return _searched(count, rollouts, branches, duration)
-
-
-@lru_cache
-def _searched(count: int, rollouts: int, branches: int, duration: int) -> tuple[About, list[SavedRollouts]]:
     agent, store = load_agent(AGENT), SegmentStore(builtin_store("test"))
-    indices = range(count)
-    dataset = SceneDataset(store, agent.interactive, agent.dynamics, indices, routes=True, duration=duration)
+    dataset = SceneDataset(
+        store, agent.interactive, agent.dynamics, range(count), routes=True, duration=duration
+    )
     config = EvaluateConfig(search="tree", score="discriminator", rollouts=rollouts, branches=branches)
-    scenes = dataset.scenes(indices)
+    scenes = dataset.scenes(range(count))
     found = simulate_batch(agent, scenes, config, keep_tree=True)
-    saved = [
-        saved_rollouts(
-            dataset.segment(b).replace(group=store.tags(b)["network"]),
-            scenes,
-            found.rollouts,
-            b,
-            goal=found.goal,
-            search=found.search,
-            driver=AGENT,
-        )
-        for b in indices
-    ]
+    how: dict[str, Any] = {"goal": found.goal, "search": found.search, "driver": AGENT}
+    segments = [dataset.segment(b).replace(group=store.tags(b)["network"]) for b in range(count)]
+    saved = [saved_rollouts(segment, scenes, found.rollouts, b, **how) for b, segment in enumerate(segments)]
     return About.of(AGENT, store, config), saved

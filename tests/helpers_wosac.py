@@ -6,13 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from helpers_sources import womd_scenario
 from symphony.data.sources import womd_pb2 as pb
 from symphony.wosac.scorer import SimulatedRollouts, WosacScenario
 
-Reals = NDArray[np.floating[Any]]
 ROAD = np.array([(-200.0, -8.0, 0.0), (0.0, -8.0, 0.0), (200.0, -8.0, 0.0)])
 """Right edge of a road along +x; the drivable side is on its left."""
 
@@ -81,11 +79,3 @@ def record_rollouts(scenario: pb.Scenario, count: int = 32, seed: int = 0) -> Si
 def write_rollouts(file: Path, rollouts: SimulatedRollouts) -> None:
     """Write a file that ``symphony wosac score`` reads."""
     np.savez(file, **vars(rollouts))
-
-
-def box(center: Reals, heading: Reals | float, length: float, width: float) -> Reals:
-    """Corners [*b, 4, 2] of centres [*b, 2]."""
-    corners = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * [length / 2, width / 2]
-    cos, sin = np.cos(heading), np.sin(heading)
-    turn = np.moveaxis(np.array([[cos, sin], [-sin, cos]]), (0, 1), (-2, -1))
-    return np.asarray(center)[..., None, :] + corners @ turn

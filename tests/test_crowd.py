@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
-from helpers_segments import LANE_WIDTH, crossing, hide, make_road, make_segment, ring, straight_road
+from helpers_agents import make_agent
+from helpers_segments import LANE_WIDTH, crossing, hide, make_road, make_segment, straight_road
 from helpers_store import fill
 from symphony import keys
-from symphony.agents import Agent, build_agent, load_agent
-from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
+from symphony.agents import Agent, load_agent
+from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.store import SegmentStore
@@ -33,7 +34,7 @@ from symphony.roadgraph import LaneGraph
 from symphony.rollouts.control import given_goals
 from symphony.rollouts.crowd import Crowd, CrowdDataset, crowd_dataset
 from symphony.rollouts.driving import simulation
-from symphony.saved.rollouts import world_of
+from symphony.saved.rollouts import SavedRollouts, world_of
 from symphony.saved.saving import save_simulation
 
 DT = 0.2
@@ -63,19 +64,9 @@ FLOW = row([(60, 10, 0), (100, 10, 0), (185, 12, 1), (-30, 12, 2), (-55, 12, 0),
 """Agent 2 leaves, 3 and 4 enter, 5 waits in its lane."""
 
 
-def tiny(**changes: Any) -> Agent:
+def tiny() -> Agent:
     """An untrained agent that follows routes and searches."""
-    spec = AgentSpec(
-        action_space="bicycle",
-        dt=DT,
-        goals=True,
-        agent=AgentConfig(num_points=12, hidden=8),
-        discriminator=DiscriminatorConfig(hidden=8),
-        searches=True,
-        search=SearchConfig(branches=4, test_branches=4, prune_every=3),
-    )
-    torch.manual_seed(0)
-    return build_agent("tiny", replace(spec, **changes))
+    return make_agent(search={"branches": 4, "test_branches": 4})
 
 
 def crowded(segment: RunSegment, crowd: Crowd = ALL, *, routes: bool = True) -> SceneBatch:
@@ -134,23 +125,16 @@ def test_everyone_who_plays_back_the_log_changes_nothing() -> None:
 
 def test_who_leaves_changes_nobody_elsewhere() -> None:
     scenes = crowded(FLOW)
-    closed = replace_fields(scenes, exits=scenes.exits[:, :0], hull=scenes.hull[:, :0] * 0)
     # Without exits and outline nobody leaves; a side of zeros keeps the traffic open.
-    closed = replace_fields(closed, hull=torch.zeros(1, 1, 3))
-    gone = scenes.interactive[0].tolist().index(2)
-    ways = [course(looking(one), 30) for one in (scenes, closed)]
-    assert not ways[0][-1][keys.VALID][0, gone]
-    assert ways[1][-1][keys.VALID][0, gone]
-    for a, b in zip(*ways, strict=True):
-        others = torch.arange(len(FLOW.agent_id)) != gone
-        assert torch.equal(a[keys.STATE][:, others], b[keys.STATE][:, others])
-        assert torch.equal(a[keys.COLLISION][:, others], b[keys.COLLISION][:, others])
-        assert torch.equal(a[keys.VALID][:, others], b[keys.VALID][:, others])
-
-
-def replace_fields(scenes: SceneBatch, **changes: Tensor) -> SceneBatch:
     fields = {name: getattr(scenes, name) for name in SceneBatch.__annotations__}
-    return SceneBatch(**{**fields, **changes}, batch_size=[len(scenes)])
+    fields |= {"exits": scenes.exits[:, :0], "hull": torch.zeros(1, 1, 3)}
+    gone = scenes.interactive[0].tolist().index(2)
+    ways = [course(looking(one), 30) for one in (scenes, SceneBatch(**fields, batch_size=[1]))]
+    assert [bool(way[-1][keys.VALID][0, gone]) for way in ways] == [False, True]
+    others = torch.arange(len(FLOW.agent_id)) != gone
+    for a, b in zip(*ways, strict=True):
+        for key in (keys.STATE, keys.COLLISION, keys.VALID):
+            assert torch.equal(a[key][:, others], b[key][:, others])
 
 
 def test_who_has_left_is_neither_hit_nor_counted_and_never_comes_back() -> None:
@@ -168,11 +152,10 @@ def test_who_has_left_is_neither_hit_nor_counted_and_never_comes_back() -> None:
 
 def test_the_edge_is_where_lanes_end_not_where_one_joins_another() -> None:
     xs = np.arange(0.0, 101.0, 2.0)
-    main = [np.stack([xs + k, np.zeros_like(xs)], -1) for k in (0, 100)]
-    ramp = np.stack([xs, np.full_like(xs, -LANE_WIDTH)], -1)
-    road = make_road([*main, ramp], successors=[(0, 1)], left=[(2, 0)], right=[(0, 2)])
-    edge = map_edge(LaneGraph(road))
-    assert np.allclose(edge.exits, [[200, 0, 1, 0]])
+    main = [np.stack([xs + k, 0 * xs], -1) for k in (0, 100)]
+    lines = [*main, np.stack([xs, 0 * xs - LANE_WIDTH], -1)]
+    road = make_road(lines, successors=[(0, 1)], left=[(2, 0)], right=[(0, 2)])
+    assert np.allclose(map_edge(LaneGraph(road)).exits, [[200, 0, 1, 0]])
 
 
 @settings(max_examples=6)
@@ -264,12 +247,12 @@ def test_batch_and_padding_change_nothing(store: SegmentStore, search: Any, othe
 
 
 def test_fewer_agents_than_asked_for(store: SegmentStore) -> None:
-    found = evaluate(tiny(), store, EvaluateConfig(rollouts=2, interactive=8))
+    config = EvaluateConfig(rollouts=2, interactive=8, search="none")
+    found = evaluate(tiny(), store, config)
     assert sorted(found.metrics.segments) == sorted(store.ids)
-    driven = [int(crowd_dataset(store, tiny(), EvaluateConfig(interactive=8)).scene(i).interactive.shape[1])
-              for i in range(4)]  # fmt: skip
+    data = crowd_dataset(store, tiny(), config)
     # Of those who move and are there at the first step, everyone.
-    assert driven == [3, 3, 3, 4]
+    assert [int(data.scene(i).interactive.shape[1]) for i in range(4)] == [3, 3, 3, 4]
 
 
 def test_who_is_driven_is_a_matter_of_choice() -> None:
@@ -313,22 +296,6 @@ def test_the_others_count_neither_in_the_log_nor_among_goals(store: SegmentStore
     assert all(count <= 2 * config.rollouts for count in drawn)
 
 
-def test_errors_of_a_metric_of_ones_own_are_over_recordings(tmp_path: Path) -> None:
-    segments = [
-        row([(60, 5 + 3 * k, 0), (85, 10, 0)], steps=11, name=f"row-{k}").replace(group=f"recording-{k % 2}")
-        for k in range(4)
-    ]
-    fill(tmp_path / "store", segments)
-    config = EvaluateConfig(rollouts=1, search="none", metric=("helpers_workers:travelled",))
-    found = evaluate("constant_velocity", SegmentStore(tmp_path / "store"), config)
-    ((path, values),) = found.own.items()
-    halves = [np.mean([values[f"row-{k}"] for k in part]) for part in ((0, 2), (1, 3))]
-    assert halves[0] != halves[1]
-    numbers = found.numbers()
-    assert numbers[path] == pytest.approx(np.mean(halves))
-    assert numbers[f"{path}_se"] == pytest.approx(abs(halves[0] - halves[1]) / 2)
-
-
 @pytest.mark.parametrize("settings", [{"interactive": "all"}, {"interactive": 2, "others": "idm"}])
 def test_the_same_seed_gives_the_same_bytes(store: SegmentStore, settings: Any, tmp_path: Path) -> None:
     def files(name: str, **more: Any) -> list[bytes]:
@@ -340,43 +307,23 @@ def test_the_same_seed_gives_the_same_bytes(store: SegmentStore, settings: Any, 
     assert files("a") != files("c", seed=6)
 
 
-def test_a_saved_world_shows_who_is_there(store: SegmentStore, tmp_path: Path) -> None:
-    config = EvaluateConfig(rollouts=1, search="none", interactive="all")
-    dataset = crowd_dataset(store, load_agent("constant_velocity"), config, [2])
-    (saved,) = save_simulation(tmp_path, load_agent("constant_velocity"), dataset, config)
-    world, segment = world_of(saved, 0), saved.segment
+def test_what_is_saved_shows_who_is_there(store: SegmentStore, tmp_path: Path) -> None:
+    def kept(agent: Agent, **changes: Any) -> SavedRollouts:
+        config = EvaluateConfig(interactive="all", **changes)
+        data = crowd_dataset(store, agent, config, [2])
+        return save_simulation(tmp_path / agent.name, agent, data, config)[0]
+
+    saved = kept(load_agent("constant_velocity"), rollouts=1, search="none")
     # At constant speed all is as logged, entering and leaving included.
-    assert (world.valid == segment.valid).all()
-    assert not segment.valid.all()
-
-
-def test_a_saved_tree_shows_who_is_there(store: SegmentStore, tmp_path: Path) -> None:
-    config = EvaluateConfig(rollouts=2, branches=4, interactive="all")
-    dataset = crowd_dataset(store, tiny(), config, [2])
-    (saved,) = save_simulation(tmp_path, tiny(), dataset, config)
+    assert (world_of(saved, 0).valid == saved.segment.valid).all()
+    assert not saved.segment.valid.all()
+    saved = kept(tiny(), rollouts=2, branches=4)
     trees, steps = saved.trees, np.arange(saved.steps)
     assert trees is not None
     assert not trees.there.all()
     for k in range(saved.rollouts):
         history = trees.slots[0, steps // trees.prune_every, k]
         np.testing.assert_array_equal(trees.there[0, history, steps], saved.counted[k])
-
-
-@pytest.mark.parametrize(
-    "segment", [straight_road(6, seed=2), crossing(4, seed=1), crossing(4, seed=5), row(cars(2)), ring()]
-)
-def test_the_car_follower_is_the_idm_planner(segment: RunSegment) -> None:
-    from symphony.planners.driver import EgoPlanners
-    from symphony.planners.interface import planner_maker
-
-    graph, quiet = LaneGraph(segment.road), load_agent("constant_velocity")
-    alone = scene(segment, [segment.ego], graph)
-    egos = EgoPlanners("idm", planner_maker("idm"), [segment])
-    one = simulation(quiet, alone, EvaluateConfig(rollouts=1), egos=egos).rollouts.state
-    ruled = scene(segment, [segment.ego], graph, background=[True])
-    many = simulation(quiet, ruled, EvaluateConfig(rollouts=1, others="idm")).rollouts.state
-    # Of what stands askew in a bend one takes the corners, the other how far it reaches along and across.
-    assert (one - many).abs().max() < (0.1 if segment.segment_id == "ring" else 0.05)
 
 
 def test_the_baseline_is_the_planner_for_everyone(store: SegmentStore) -> None:
@@ -392,21 +339,19 @@ def test_the_baseline_is_the_planner_for_everyone(store: SegmentStore) -> None:
 
 
 def test_the_baseline_takes_a_given_route_and_no_other_rule() -> None:
-    segment = crossing(4, seed=1)
+    segment, idm = crossing(4, seed=1), load_agent("idm")
     scenes = scene(segment, [0, 1], LaneGraph(segment.road))
+
+    def end(**given: Any) -> Tensor:
+        return simulation(idm, scenes, EvaluateConfig(rollouts=1), **given).rollouts.state[0, 0, -1, :, :2]
+
     routes = [int(n) for n in scenes.route_count[0, 0].gt(1).nonzero()[:, 0]]
-    ends = [
-        simulation(
-            load_agent("idm"), scenes, EvaluateConfig(rollouts=1), given=torch.tensor([[route, -1]])
-        ).rollouts.state[0, 0, -1, :, :2]
-        for route in routes
-    ]
-    logged = simulation(load_agent("idm"), scenes, EvaluateConfig(rollouts=1)).rollouts.state[0, 0, -1, :, :2]
+    ends = {route: end(given=torch.tensor([[route, -1]])) for route in routes}
     assert len(routes) > 1
-    assert torch.equal(ends[routes.index(int(scenes.route_logged[0, 0]))], logged)
-    assert max(float((end[0] - logged[0]).norm()) for end in ends) > 1.0
+    assert torch.equal(ends[int(scenes.route_logged[0, 0])], end())
+    assert max(float((place[0] - end()[0]).norm()) for place in ends.values()) > 1.0
     with pytest.raises(ConfigError, match="among others that 'constant_velocity' drives"):
-        simulation(load_agent("idm"), scenes, EvaluateConfig(rollouts=1, others="constant_velocity"))
+        simulation(idm, scenes, EvaluateConfig(rollouts=1, others="constant_velocity"))
 
 
 def test_a_goal_is_a_route_over_its_lane_or_past_its_point() -> None:

@@ -1,29 +1,30 @@
-"""The search through the driving environment, and the evaluator's kinds of it."""
+"""The search through the driving environment, the evaluator's kinds of it, and the goals that branches follow."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from itertools import pairwise
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
+from helpers_agents import make_agent
 from helpers_segments import crossing, make_road, make_segment, straight_road
+from helpers_store import fill
 from symphony import keys
-from symphony.agents import Agent, build_agent
-from symphony.collectors import BeamSearchResult, KeepBest
-from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, EvaluateConfig, SearchConfig
+from symphony.agents import Agent
+from symphony.collectors import BeamSearchResult, KeepBest, ReplaceBad
+from symphony.config import EvaluateConfig, SearchConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
-from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, DrivingEnv, scene
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
@@ -31,39 +32,12 @@ from symphony.evaluation import evaluate
 from symphony.learning.demonstrations import SceneDataset
 from symphony.modules import SeededNoise
 from symphony.rollouts import simulate
-from symphony.rollouts.driving import simulate_batch, simulation
-from symphony.rollouts.search import flag_score, search
-from symphony.rollouts.unroll import Rollouts, draw_goals, rollouts_of
+from symphony.rollouts.driving import Simulation, simulation
+from symphony.rollouts.search import search
+from symphony.rollouts.unroll import Rollouts, draw_goals, rollouts_of, start_states
 
-EVERY = 2
-SEARCH = SearchConfig(branches=4, test_branches=4, prune_every=EVERY)
+SEARCH = {"branches": 4, "test_branches": 4, "prune_every": 2}
 KINDS = ("none", "tree", "backtrack", "best")
-
-
-def make_agent(seed: int = 0, discriminator: int = 0, **changes: Any) -> Agent:
-    """A tiny untrained agent that follows routes; ``discriminator`` is the seed of that alone."""
-    spec = AgentSpec(
-        action_space="bicycle",
-        dt=0.2,
-        goals=True,
-        agent=AgentConfig(num_points=12, hidden=8),
-        discriminator=DiscriminatorConfig(hidden=8),
-        searches=True,
-        search=SEARCH,
-    )
-    spec = replace(spec, **changes)
-    torch.manual_seed(seed)
-    agent = build_agent("tiny", spec)
-    torch.manual_seed(discriminator)
-    return replace(agent, discriminator=build_agent("tiny", spec).discriminator)
-
-
-def searching(agent: Agent, **changes: Any) -> Agent:
-    """The same agent, trained with another search."""
-    assert agent.spec is not None
-    return replace(agent, spec=replace(agent.spec, search=replace(agent.search, **changes)))
-
-
 SEGMENTS = [
     crossing(3, seed=1, steps=5),
     straight_road(4, seed=0, steps=8),
@@ -73,12 +47,16 @@ SEGMENTS = [
 DECISIONS = 7
 
 
+def searching(agent: Agent, **changes: Any) -> Agent:
+    """The same agent, trained with another search."""
+    assert agent.spec is not None
+    return replace(agent, spec=replace(agent.spec, search=replace(agent.search, **changes)))
+
+
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> SegmentStore:
     path = tmp_path_factory.mktemp("data") / "store"
-    with StoreWriter(path) as writer:
-        for segment in SEGMENTS:
-            writer.append(segment)
+    fill(path, SEGMENTS)
     return SegmentStore(path)
 
 
@@ -88,13 +66,18 @@ def dataset(store: SegmentStore) -> SceneDataset:
 
 
 @pytest.fixture(scope="module")
-def agent() -> Agent:
-    return make_agent()
+def scenes(dataset: SceneDataset) -> SceneBatch:
+    return dataset.scenes(range(4))
 
 
 @pytest.fixture(scope="module")
-def env(dataset: SceneDataset, agent: Agent) -> DrivingEnv:
-    return DrivingEnv(dataset.scenes(range(4)), agent.dynamics, agent.observation)
+def agent() -> Agent:
+    return make_agent(search=SEARCH)
+
+
+@pytest.fixture(scope="module")
+def env(scenes: SceneBatch, agent: Agent) -> DrivingEnv:
+    return DrivingEnv(scenes, agent.dynamics, agent.observation)
 
 
 def start_of(env: DrivingEnv, branches: int) -> TensorDict:
@@ -103,21 +86,21 @@ def start_of(env: DrivingEnv, branches: int) -> TensorDict:
 
 
 def look(env: DrivingEnv, agent: Agent, start: TensorDict, **changes: Any) -> BeamSearchResult:
-    settings: dict[str, Any] = {"seed": 5, "rule": KeepBest(0.5), "prune_every": EVERY}
+    settings: dict[str, Any] = {"seed": 5, "rule": KeepBest(0.5), "prune_every": 2, **changes}
     with torch.no_grad():
-        return search(env, agent.policy, agent.discriminator, start, **{**settings, **changes})
+        return search(env, agent.policy, agent.discriminator, start, **settings)
 
 
-def plain(env: DrivingEnv, agent: Agent, start: TensorDict, seed: int = 5) -> Rollouts:
-    return simulate(env, TensorDictSequential(SeededNoise(seed), agent.policy), start)
+def plain(env: DrivingEnv, agent: Agent, start: TensorDict) -> Rollouts:
+    return simulate(env, TensorDictSequential(SeededNoise(5), agent.policy), start)
+
+
+def driven(agent: Agent, scenes: SceneBatch, kind: Any = "tree", **changes: Any) -> Simulation:
+    return simulation(agent, scenes, EvaluateConfig(**{"search": kind, "rollouts": 4, **changes}))
 
 
 def same(a: Rollouts, b: Rollouts) -> bool:
     return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
-
-
-def part(rollouts: Rollouts, *index: Any) -> Rollouts:
-    return Rollouts(*(value[index] for value in rollouts))
 
 
 def scored(env: DrivingEnv, agent: Agent, start: TensorDict, states: Tensor) -> Tensor:
@@ -127,11 +110,9 @@ def scored(env: DrivingEnv, agent: Agent, start: TensorDict, states: Tensor) -> 
     state = start.select(keys.SCENE, keys.STREAM, keys.VALID, keys.GOAL).unsqueeze(-1).expand(*whole).clone()
     before, come = env._read(start), []
     for t in range(steps):
-        now = env._progress(before, states[:, :, t + 1])
-        before = before._replace(state=states[:, :, t + 1], progress=now)
-        come.append(now)
-    state.set(keys.PROGRESS, torch.stack(come, 2))
-    state.set(keys.STATE, states[:, :, 1:])
+        come.append(env._progress(before, states[:, :, t + 1]))
+        before = before._replace(state=states[:, :, t + 1], progress=come[-1])
+    state.set(keys.PROGRESS, torch.stack(come, 2)).set(keys.STATE, states[:, :, 1:])
     state.set(keys.STEP, torch.arange(1, steps + 1)[:, None].expand(*whole, 1))
     with torch.no_grad():
         assert agent.discriminator is not None
@@ -140,33 +121,31 @@ def scored(env: DrivingEnv, agent: Agent, start: TensorDict, states: Tensor) -> 
 
 def test_one_branch_is_a_plain_rollout(env: DrivingEnv, agent: Agent) -> None:
     start = start_of(env, 1)
-    found = rollouts_of(env, start, look(env, agent, start).trajectories)
-    assert same(found, plain(env, agent, start))
+    assert same(rollouts_of(env, start, look(env, agent, start).trajectories), plain(env, agent, start))
 
 
-def test_the_actions_of_every_leaf_lead_where_it_went(env: DrivingEnv, agent: Agent) -> None:
-    start = start_of(env, 4)
-    result = look(env, agent, start)
-    # Some leaf must have been simulated in more than one slot, else nothing was forked.
-    assert (result.slots != result.slots[:, :1]).any()
-    found, actions, now = (
-        rollouts_of(env, start, result.trajectories),
-        result.trajectories[keys.ACTION],
-        start,
-    )
-    for t in range(actions.shape[2]):
-        now = step_mdp(env.step(now.clone(False).set(keys.ACTION, actions[:, :, t])))
-        assert torch.equal(now[keys.STATE], found.state[:, :, t + 1])
-        assert torch.equal(now[keys.COLLISION].squeeze(-1), found.collision[:, :, t])
-        assert torch.equal(now[keys.OFFROAD].squeeze(-1), found.offroad[:, :, t])
-
-
-def test_what_the_search_scored_is_what_the_discriminator_says_of_the_leaves(
+def test_leaves_follow_their_actions_and_goals_and_are_scored_as_they_are(
     env: DrivingEnv, agent: Agent
 ) -> None:
+    seen: list[Tensor] = []
+
+    def spy(goal: Tensor) -> None:
+        seen.append(goal.clone())
+
     start = start_of(env, 4)
-    result = look(env, agent, start, keep_tree=True)
-    found = rollouts_of(env, start, result.trajectories)
+    policy = TensorDictSequential(TensorDictModule(spy, [keys.GOAL], []), agent.policy)
+    result = look(env, replace(agent, policy=policy), start, keep_tree=True)
+    # What the policy is shown after forks is still the route of the start.
+    assert len(seen) == DECISIONS
+    assert all(torch.equal(goal, start[keys.GOAL]) for goal in seen)
+    # Some leaf must have been simulated in more than one slot, else nothing was forked.
+    assert (result.slots != result.slots[:, :1]).any()
+    found, now = rollouts_of(env, start, result.trajectories), start
+    for t, action in enumerate(result.trajectories[keys.ACTION].unbind(2)):
+        now = step_mdp(env.step(now.clone(False).set(keys.ACTION, action)))
+        assert torch.equal(now[keys.STATE], found.state[:, :, t + 1])
+        for key, flags in ((keys.COLLISION, found.collision), (keys.OFFROAD, found.offroad)):
+            assert torch.equal(now[key].squeeze(-1), flags[:, :, t])
     assert result.tree is not None
     tree = torch.cat([start[keys.STATE][:, :, None], result.tree[("next", *keys.STATE)]], 2)
     counted = found.counted.any(-1)
@@ -177,52 +156,34 @@ def test_what_the_search_scored_is_what_the_discriminator_says_of_the_leaves(
     assert not counted.all()
 
 
-def test_an_agents_goal_is_that_of_its_tree_in_every_branch(env: DrivingEnv, agent: Agent) -> None:
-    """What the policy is shown after forks is still the route of the start."""
-    seen = []
-
-    class Spy(torch.nn.Module):
-        def forward(self, td: TensorDictBase) -> TensorDictBase:
-            seen.append(td.get(keys.GOAL).clone())
-            return td
-
-    start = start_of(env, 4)
-    assert agent.policy is not None
-    look(env, replace(agent, policy=TensorDictSequential(_module(Spy()), agent.policy)), start)
-    assert len(seen) == DECISIONS
-    assert all(torch.equal(goal, start[keys.GOAL]) for goal in seen)
+# Of a seed, whatever lies beside it
 
 
-def _module(inner: torch.nn.Module) -> Any:
-    """An inner module that takes the whole TensorDict, where TensorDictSequential takes modules with keys."""
-    inner.in_keys, inner.out_keys = [keys.GOAL], []
-    return inner
-
-
-@pytest.mark.parametrize(("goals", "kind"), [(False, "tree"), *((True, kind) for kind in KINDS[1:])])
-def test_no_rollout_depends_on_the_batch(store: SegmentStore, kind: Any, goals: bool) -> None:
-    agent = make_agent(goals=goals)
-    one, three = (
-        evaluate(agent, store, EvaluateConfig(search=kind, rollouts=4, trees=2, batch=b)).metrics.rows()
-        for b in (1, 3)
-    )
-    assert one == three
-    assert len({row["ade"] for row in one}) == 4
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_no_rollout_depends_on_the_order_of_segments(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
-    config, order = EvaluateConfig(search=kind, rollouts=4, trees=2), [2, 0, 3, 1]
-    sorted_ = simulate_batch(agent, dataset.scenes(range(4)), config).rollouts
-    mixed = simulate_batch(agent, dataset.scenes(order), config).rollouts
-    counted = sorted_.counted[order]
-    assert torch.equal(mixed.counted, counted)
-    real = counted.any(-1)
-    for a, b in (
-        (mixed.state[:, :, 1:], sorted_.state[order][:, :, 1:]),
-        (mixed.collision, sorted_.collision[order]),
-    ):
-        assert torch.equal(a[real], b[real])
+@pytest.mark.parametrize(("goals", "kind"), [(False, "tree"), *((True, kind) for kind in KINDS)])
+def test_no_rollout_depends_on_batch_or_order(dataset: SceneDataset, kind: Any, goals: bool) -> None:
+    agent, order = make_agent(search=SEARCH, goals=goals), [2, 0, 3, 1]
+    scenes = dataset.scenes(range(4))
+    whole = driven(agent, scenes, kind, trees=2, seed=3)
+    mixed = driven(agent, dataset.scenes(order), kind, trees=2, seed=3)
+    again = driven(agent, scenes, kind, trees=2, seed=4)
+    assert not torch.equal(again.rollouts.state, whole.rollouts.state)
+    for item in range(4):
+        alone = driven(agent, dataset.scenes([item]), kind, trees=2, seed=3)
+        steps = alone.rollouts.counted.shape[2]
+        for name in Rollouts._fields:
+            value, place = getattr(whole.rollouts, name)[item], order.index(item)
+            cut = steps + (name == "state")
+            assert torch.equal(value[:, :cut], getattr(alone.rollouts, name)[0])
+            assert torch.equal(value[:, :cut], getattr(mixed.rollouts, name)[place][:, :cut])
+        assert torch.equal(whole.goal[item], alone.goal[0])
+    found = whole.rollouts
+    assert found.state.shape == (4, 4, DECISIONS + 1, 2, 4)
+    first = scenes.log_state[:, 0].gather(1, scenes.interactive[..., None].expand(4, 2, 5))
+    assert torch.equal(found.state[:, :, 0, :, :3], first[:, None, :, :3].expand(-1, 4, -1, -1))
+    step = (found.state[:, :, 1:, :, :2] - found.state[:, :, :-1, :, :2]).norm(dim=-1)
+    assert step.max() < 6  # 30 m/s; elsewhere in another segment it would be tens of metres
+    ends = torch.tensor([segment.num_steps - 1 for segment in SEGMENTS])
+    assert torch.equal(found.counted.sum(2), ends[:, None, None].expand(4, 4, 2))
 
 
 @pytest.mark.parametrize(("rule", "trees"), [("replace", 1), ("replace", 2), ("best", 2)])
@@ -230,15 +191,12 @@ def test_longer_segments_beside_it_choose_no_leaves(
     dataset: SceneDataset, agent: Agent, rule: Any, trees: int
 ) -> None:
     agent = searching(agent, rule=rule, threshold=0.1)
-    config = EvaluateConfig(rollouts=4, trees=trees)
-    scenes = dataset.scenes(range(4))
-    together = simulation(agent, scenes, config)
+    together = driven(agent, dataset.scenes(range(4)), "agent", trees=trees)
+    assert together.search is not None
     for item in range(4):
-        alone = simulation(agent, dataset.scenes([item]), config)
+        alone = driven(agent, dataset.scenes([item]), "agent", trees=trees)
         steps = alone.rollouts.state.shape[2]
         assert torch.equal(together.rollouts.state[item][:, :steps], alone.rollouts.state[0])
-        assert torch.equal(together.goal[item], alone.goal[0])
-        assert together.search is not None
         assert alone.search is not None
         periods = alone.search.slots.shape[-2]
         assert torch.equal(together.search.slots[item][:, :periods], alone.search.slots[0])
@@ -246,98 +204,56 @@ def test_longer_segments_beside_it_choose_no_leaves(
         torch.testing.assert_close(scores, alone.search.scores[0], rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_rollouts_of_a_segment_stay_in_it(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
-    scenes = dataset.scenes(range(4))
-    found = simulate_batch(agent, scenes, EvaluateConfig(search=kind, rollouts=4, trees=2)).rollouts
-    assert found.state.shape == (4, 4, DECISIONS + 1, 2, 4)
-    assert found.collision.shape == found.offroad.shape == found.counted.shape == (4, 4, DECISIONS, 2)
-    first = scenes.log_state[:, 0].gather(1, scenes.interactive[..., None].expand(4, 2, 5))
-    assert torch.equal(found.state[:, :, 0, :, :3], first[:, None, :, :3].expand(-1, 4, -1, -1))
-    step = (found.state[:, :, 1:, :, :2] - found.state[:, :, :-1, :, :2]).norm(dim=-1)
-    assert step.max() < 6  # 30 m/s; elsewhere in another segment it would be tens of metres
-    ends = torch.tensor([s.num_steps - 1 for s in SEGMENTS])
-    assert torch.equal(found.counted.sum(2), ends[:, None, None].expand(4, 4, 2))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_seed_decides_the_rollouts(dataset: SceneDataset, agent: Agent, kind: Any) -> None:
-    scenes = dataset.scenes([0])
-    a, b, c = (
-        simulate_batch(agent, scenes, EvaluateConfig(search=kind, rollouts=2, seed=s)).rollouts
-        for s in (3, 3, 4)
-    )
-    assert same(a, b)
-    assert not torch.equal(a.state, c.state)
-
-
-def test_trees_of_one_branch_are_independent_rollouts(dataset: SceneDataset, agent: Agent) -> None:
-    scenes = dataset.scenes(range(4))
-    none = simulate_batch(agent, scenes, EvaluateConfig(search="none", rollouts=3)).rollouts
-    tree = simulate_batch(
-        agent, scenes, EvaluateConfig(search="tree", rollouts=3, trees=3, branches=1)
-    ).rollouts
-    assert same(none, tree)
+def test_trees_of_one_branch_are_independent_rollouts(scenes: SceneBatch, agent: Agent) -> None:
+    none = driven(agent, scenes, "none", rollouts=3).rollouts
+    assert same(none, driven(agent, scenes, rollouts=3, trees=3, branches=1).rollouts)
 
 
 @pytest.mark.parametrize("score", ["discriminator", "rule"])
-def test_more_trees_keep_the_first_ones(dataset: SceneDataset, agent: Agent, score: Any) -> None:
-    scenes = dataset.scenes(range(4))
-    few = simulate_batch(
-        agent, scenes, EvaluateConfig(search="tree", score=score, rollouts=4, trees=2)
-    ).rollouts
-    many = simulate_batch(
-        agent, scenes, EvaluateConfig(search="tree", score=score, rollouts=6, trees=3)
-    ).rollouts
-    assert same(few, part(many, slice(None), slice(0, 4)))
+def test_more_trees_keep_the_first_ones(scenes: SceneBatch, agent: Agent, score: Any) -> None:
+    few = driven(agent, scenes, score=score, trees=2).rollouts
+    many = driven(agent, scenes, score=score, rollouts=6, trees=3).rollouts
+    assert same(few, Rollouts(*(value[:, :4] for value in many)))
 
 
 @pytest.mark.parametrize("changes", [{"rule": "systematic"}, {"prune_every": 3}, {"temperature": 0.01}])
 def test_the_evaluation_decides_the_pruning(
-    dataset: SceneDataset, agent: Agent, changes: dict[str, Any]
+    scenes: SceneBatch, agent: Agent, changes: dict[str, Any]
 ) -> None:
-    scenes, config = dataset.scenes(range(4)), EvaluateConfig(search="tree", rollouts=4)
     agent = searching(agent, rule="systematic" if "temperature" in changes else "best")
-    trained = searching(agent, **changes)
-    found = simulate_batch(agent, scenes, replace(config, **changes)).rollouts
-    assert same(found, simulate_batch(trained, scenes, config).rollouts)
-    assert not same(found, simulate_batch(agent, scenes, config).rollouts)
+    found = driven(agent, scenes, **changes).rollouts
+    assert same(found, driven(searching(agent, **changes), scenes).rollouts)
+    assert not same(found, driven(agent, scenes).rollouts)
 
 
-def goals_of(
-    monkeypatch: pytest.MonkeyPatch, agent: Agent, scenes: SceneBatch, config: EvaluateConfig
-) -> tuple[Tensor, Tensor]:
-    """Goals [B, trees, N] drawn on the way, and the states of the rollouts."""
-    found = []
-
-    def noted(*args: Any) -> Tensor:
-        found.append(draw_goals(*args))
-        return found[-1]
-
-    with monkeypatch.context() as patch:
-        patch.setattr(sys.modules["symphony.rollouts.unroll"], "draw_goals", noted)
-        state = simulate_batch(agent, scenes, config).rollouts.state
-    assert len(found) == 1
-    return found[0], state
+# Goals
 
 
 def test_neither_discriminator_nor_search_touches_the_goals(
-    dataset: SceneDataset, agent: Agent, monkeypatch: pytest.MonkeyPatch
+    scenes: SceneBatch, agent: Agent, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scenes = dataset.scenes(range(4))
-    reference, none = goals_of(monkeypatch, agent, scenes, EvaluateConfig(search="none", rollouts=5))
-    assert len(reference[1, :, 0].unique()) > 1  # else there is nothing to bias
-    strict = replace(agent, discriminator=make_agent(discriminator=1).discriminator)
-    driven = []
-    ways: list[tuple[Any, Any, Agent]] = [("tree", "discriminator", scorer) for scorer in (agent, strict)]
-    for kind, score, scorer in (*ways, ("tree", "flags", agent), ("best", "discriminator", strict)):
-        trees = 1 if kind == "best" else 5
-        config = EvaluateConfig(search=kind, score=score, rollouts=5, trees=trees, branches=3, rule="best")
-        goals, state = goals_of(monkeypatch, scorer, scenes, config)
-        assert torch.equal(goals, reference)
-        driven.append(state)
+    drawn: list[Tensor] = []
+
+    def noted(*args: Any) -> Tensor:
+        drawn.append(draw_goals(*args))
+        return drawn[-1]
+
+    monkeypatch.setattr(sys.modules["symphony.rollouts.unroll"], "draw_goals", noted)
+    other = replace(agent, discriminator=make_agent(seed=1, search=SEARCH).discriminator)
+    states = [driven(agent, scenes, "none", rollouts=5).rollouts.state]
+    assert len(drawn[0][1, :, 0].unique()) > 1  # else there is nothing to bias
+    for kind, score, scorer in (
+        ("tree", "discriminator", agent),
+        ("tree", "discriminator", other),
+        ("tree", "flags", agent),
+        ("best", "discriminator", other),
+    ):
+        how: dict[str, Any] = {"score": score, "rollouts": 5, "branches": 3, "rule": "best"}
+        how["trees"] = 1 if kind == "best" else 5
+        states.append(driven(scorer, scenes, kind, **how).rollouts.state)
+    assert all(torch.equal(goals, drawn[0]) for goals in drawn)
     # Each of them does change what survives.
-    assert all(not torch.equal(a, b) for a, b in zip([none, *driven], [*driven, none], strict=True))
+    assert all(not torch.equal(a, b) for a, b in pairwise(states))
 
 
 def test_goals_depend_on_seed_scene_and_tree_alone(env: DrivingEnv, agent: Agent) -> None:
@@ -348,46 +264,96 @@ def test_goals_depend_on_seed_scene_and_tree_alone(env: DrivingEnv, agent: Agent
     rows = torch.randperm(160, generator=torch.Generator().manual_seed(0))[:50]
     other = env.start(rows // 40, 3)
     assert torch.equal(draw_goals(env, agent.goals, other, 7, rows % 40), whole.flatten(0, 1)[rows])
-    assert torch.equal(draw_goals(env, agent.goals, start[2, :3], 7, tree[2, :3]), whole[2, :3])
     assert not torch.equal(draw_goals(env, agent.goals, start, 8, tree), whole)
     counts = env.scenes.route_count > 0
     assert (whole[..., None] == torch.arange(counts.shape[-1])).any(1)[counts].float().mean() > 0.9
     assert counts.gather(-1, whole.transpose(1, 2)).all()
 
 
-def test_logged_goals_are_the_logged_routes(dataset: SceneDataset, agent: Agent) -> None:
-    scenes = dataset.scenes(range(4))
-    config = EvaluateConfig(search="none", rollouts=3, logged_goals=True)
-    goals = simulation(agent, scenes, config).goal
-    assert torch.equal(goals, scenes.route_logged[:, None].expand(-1, 3, -1))
+def test_logged_goals_are_the_logged_routes(scenes: SceneBatch, agent: Agent) -> None:
+    goals = driven(agent, scenes, "none", logged_goals=True).goal
+    assert torch.equal(goals, scenes.route_logged[:, None].expand_as(goals))
 
 
-def test_agents_without_any_route_are_no_error(tmp_path: Path, agent: Agent) -> None:
+def test_agents_without_any_route_are_no_error(agent: Agent) -> None:
     segment = straight_road(3, steps=9)
-    position = segment.position.copy()
-    position[..., 1] += 200
-    with StoreWriter(tmp_path / "store") as writer:
-        writer.append(segment.replace(position=position))
-    result = evaluate(agent, tmp_path / "store", EvaluateConfig(search="tree", rollouts=2, trees=1))
-    assert np.isfinite(result.numbers()["ade"])
+    position = segment.position + np.array([0, 200, 0], np.float32)
+    data = scene(segment.replace(position=position), [0, 1], None)
+    assert (driven(make_agent(search=SEARCH, goals=False), data).goal == -1).all()
+    from symphony.roadgraph import LaneGraph
+
+    nowhere = scene(segment.replace(position=position), [0, 1], LaneGraph(segment.road))
+    assert driven(agent, nowhere, rollouts=2).rollouts.state.isfinite().all()
 
 
-def test_best_is_the_best_of_independent_rollouts(dataset: SceneDataset, agent: Agent) -> None:
-    scenes, branches = dataset.scenes(range(4)), 3
-    config = EvaluateConfig(search="best", rollouts=2, branches=branches, logged_goals=True, seed=5)
-    found = simulate_batch(agent, scenes, config).rollouts
-    env = DrivingEnv(scenes, agent.dynamics, agent.observation)
-    start = start_of(env, 2 * branches)
+def branching(agent: Agent, scenes: SceneBatch, **changes: Any) -> Simulation:
+    """Eight branches, each of which draws its own goals."""
+    how = {"search": "tree", "rollouts": 8, "branches": 8, "goals": "branch", "seed": 3, **changes}
+    return simulation(agent, scenes, EvaluateConfig(**how))
+
+
+def test_branches_draw_the_goals_that_trees_of_one_would(env: DrivingEnv, agent: Agent) -> None:
+    settings: dict[str, Any] = {"seed": 3, "goals_per": "branch"}
+    mine = start_states(env, agent.goals, trees=2, branches=4, **settings)
+    alone = start_states(env, agent.goals, trees=8, branches=1, seed=3)
+    for key in (keys.GOAL, keys.STREAM):
+        assert torch.equal(mine.get(key).flatten(1, 2), alone.get(key)[:, :, 0])
+    goal = mine.get(keys.GOAL)[0].flatten(0, 1)
+    assert (goal != goal[0]).any()  # at a crossing
+    shared = start_states(env, agent.goals, trees=2, branches=4, seed=3).get(keys.GOAL)
+    assert (shared == shared[:, :, :1]).all()
+
+
+def test_with_nothing_to_replace_a_search_is_independent_rollouts(agent: Agent, scenes: SceneBatch) -> None:
+    free = branching(agent, scenes, search="none", goals="tree")
+    searched = branching(agent, scenes, rule="replace", threshold=1e9)
+    # The best leaves come first; which they are is the same.
+    for mine, theirs in zip(searched.rollouts.state, free.rollouts.state, strict=True):
+        assert {path.numpy().tobytes() for path in mine} == {path.numpy().tobytes() for path in theirs}
+    for rule in ("best", "systematic", "replace"):
+        left = branching(agent, scenes, rule=rule, threshold=0.0).goal
+        # [B, K, K, N]: every leaf beside every draw of its scene.
+        assert (left[:, :, None] == free.goal[:, None]).all(-1).any(-1).all()
+
+
+class Middle:
+    """Rule `replace` with a threshold in the middle of each tree's scores; keeps what it was asked."""
+
+    takes_groups = True
+    asked: ClassVar[list[tuple[Tensor, Tensor]]] = []
+
+    def __call__(self, totals: Tensor, noise: Tensor, groups: Tensor | None = None) -> Tensor:
+        assert groups is not None
+        above = totals - totals.median(-1, keepdim=True).values
+        self.asked.append((above > 0, groups))
+        return ReplaceBad(0.0)(above, noise, groups)
+
+
+def test_copies_prefer_a_parent_of_the_same_goals(agent: Agent, scenes: SceneBatch) -> None:
+    """A slot keeps its goals as long as any branch of the same goals is good."""
+    Middle.asked.clear()
+    branching(agent, scenes, rule="test_search:Middle")
+    replaced = 0
+    asked = sys.modules["test_search"].Middle.asked
+    for (bad, groups), (_, later) in pairwise(asked):
+        same_goals = groups[..., :, None] == groups[..., None, :]
+        kept = (same_goals & ~bad[..., None, :]).any(-1)
+        assert (later == groups)[kept].all()
+        replaced += int((kept & bad).sum())
+    assert replaced > 0
+
+
+# What is looked for
+
+
+def test_best_is_the_best_of_independent_rollouts(scenes: SceneBatch, env: DrivingEnv, agent: Agent) -> None:
+    found = driven(agent, scenes, "best", rollouts=2, branches=3, logged_goals=True, seed=5).rollouts
+    start = start_of(env, 6)
     every = plain(env, agent, start)
     scores = scored(env, agent, start, every.state).masked_fill(~every.counted, -torch.inf)
-    total = scores.amax(2).sum(-1).unflatten(1, (2, branches))
-    best = total.argmin(-1) + branches * torch.arange(2)
+    best = scores.amax(2).sum(-1).unflatten(1, (2, 3)).argmin(-1) + 3 * torch.arange(2)
     for b in range(4):
-        one, other = part(found, b), part(every, b, best[b])
-        # Flags are those between states there, and at states here.
-        assert all(
-            torch.equal(getattr(one, name), getattr(other, name)) for name in ("state", "offroad", "counted")
-        )
+        assert same(Rollouts(*(part[b] for part in found)), Rollouts(*(part[b, best[b]] for part in every)))
     assert best.unique().numel() > 2
 
 
@@ -399,8 +365,7 @@ def blocked() -> RunSegment:
     line, side = np.stack([x, 0 * x], -1), np.array([0, 9.0])
     road = make_road([line], boundary=[line - side, (line + side)[::-1]])
     speed = np.stack([np.full(steps, 7.0), np.maximum(0, 7 - 2 * time), np.maximum(0, 6 - 3 * time)])
-    driven = np.cumsum(speed * dt, 1) - speed * dt
-    place = np.array([[0.0], [18.0], [32.0]]) + driven
+    place = np.array([[0.0], [18.0], [32.0]]) + np.cumsum(speed * dt, 1) - speed * dt
     flat = np.zeros_like(place)
     velocity = np.stack([speed, flat], -1)
     return make_segment(road, np.stack([place, flat], -1), flat, velocity, dt, "blocked")
@@ -414,29 +379,14 @@ def test_an_oracle_replaces_what_is_flagged_whatever_the_agent_was_trained_with(
         assert EvaluateConfig(score=score).pruning(settings).threshold == 0.0
         assert EvaluateConfig(score=score, threshold=2.0).pruning(settings).threshold == 2.0
     assert EvaluateConfig(search="tree").pruning(settings).threshold == trained
-    agent, scenes = make_agent(goals=False), scene(blocked(), [0, 1])
-    how: dict[str, Any] = {"score": "flags", "rule": "replace", "prune_every": 2}
-    how |= {"rollouts": 16, "trees": 2, "branches": 8}
+    agent, data = make_agent(search=SEARCH, goals=False), scene(blocked(), [0, 1])
+    how: dict[str, Any] = {"score": "flags", "rule": "replace", "rollouts": 16, "trees": 2, "branches": 8}
     rates = []
-    kinds: tuple[Any, ...] = ("none", "tree")
-    for kind in kinds:
-        found = simulation(agent, scenes, EvaluateConfig(search=kind, **how)).rollouts
+    for kind in ("none", "tree"):
+        found = driven(agent, data, kind, **how).rollouts
         rates.append(float((found.collision & found.counted).any(-1).any(-1).float().mean()))
     assert rates[0] > 0.3
     assert rates[1] < 0.5 * rates[0]
-
-
-def test_the_oracle_scores_flags_of_real_agents_alone() -> None:
-    shape = (3, 2)
-    flags = TensorDict(
-        {
-            keys.COLLISION: torch.tensor([[1, 0], [0, 0], [1, 1]]).bool()[..., None],
-            keys.OFFROAD: torch.tensor([[0, 0], [1, 0], [1, 1]]).bool()[..., None],
-            keys.VALID: torch.tensor([[1, 1], [1, 1], [1, 0]]).bool(),
-        },
-        batch_size=shape[:1],
-    )
-    assert flag_score(flags).tolist() == [[1, 0], [1, 0], [1, 0]]
 
 
 def test_kinds_and_sizes_that_do_not_fit_are_refused(store: SegmentStore, agent: Agent) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -20,16 +20,6 @@ from symphony.recipes import train
 from symphony.rollouts.driving import simulate_batch
 
 
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "store"
@@ -37,24 +27,27 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def by(threads: int, work: Callable[[], Any]) -> Any:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        return work()
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_rollouts_are_the_same_with_any_number_of_threads(store: Path) -> None:
-    agent = load_agent("pretrained:bc_ts_h")
-    dataset = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True)
-    found = []
-    for count in (1, 2):
-        with threads(count):
-            found.append(
-                simulate_batch(agent, dataset.scenes([0, 1]), EvaluateConfig(rollouts=2, branches=4)).rollouts
-            )
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+    agent, config = load_agent("pretrained:bc_ts_h"), EvaluateConfig(rollouts=2, branches=4)
+    scenes = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True).scenes([0, 1])
+    one, two = (by(count, lambda: simulate_batch(agent, scenes, config).rollouts) for count in (1, 2))
+    assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
 
 
 def test_weights_repeat_with_as_many_threads_and_are_close_with_others(store: Path, tmp_path: Path) -> None:
-    found = []
-    for name, count in (("one", 1), ("two", 2), ("again", 2)):
-        with threads(count):
-            found.append(weights(train(tiny("bc_ts", store, tmp_path / name, steps=2))))
-    one, two, again = found
+    one, two, again = (
+        by(count, lambda name=name: weights(train(tiny("bc_ts", store, tmp_path / name, steps=2))))  # type: ignore[misc]
+        for name, count in (("one", 1), ("two", 2), ("again", 2))
+    )
     assert same_weights(two, again)
     for name, value in one.items():
         torch.testing.assert_close(two[name], value, rtol=1e-3, atol=1e-5)

@@ -18,7 +18,7 @@ from symphony.cli import main
 from symphony.config import EvaluateConfig, WosacSettings
 from symphony.data.segment import AgentType
 from symphony.data.store import SegmentStore
-from symphony.errors import ConfigError, DataError
+from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation.formats import FORMATS
 from symphony.evaluation.table import WOSAC, Entry, compare
 from symphony.wosac.evaluate import evaluate_wosac, simulated_how
@@ -115,54 +115,34 @@ def test_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert record["agents"][AGENT]["metametric_se"] is None
 
 
-def test_evaluation_of_nothing_is_refused(tmp_path: Path) -> None:
-    fill(tmp_path / "store", [straight_road()])
-    store = SegmentStore(tmp_path / "store")
-    with pytest.raises(DataError, match="no run segments"):
-        evaluate_wosac(load_agent(RANDOM), store, [], PLAIN)
-    with pytest.raises(ConfigError, match="config must be one of"):
-        evaluate_wosac(load_agent(RANDOM), store, [0], PLAIN, "2023")
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_segment_that_cannot_be_scored_ends_no_others(workers: int, tmp_path: Path) -> None:
+def test_a_segment_that_cannot_be_scored_ends_no_others_whatever_the_workers(tmp_path: Path) -> None:
     whole = [crossing(num_agents=2, seed=k) for k in range(2)]
-    bare = whole[0].replace(
-        segment_id="bare", road=replace(whole[0].road, boundary=whole[0].road.boundary.of([]))
-    )
-    walkers = whole[0].replace(
-        segment_id="walkers", agent_type=np.full_like(whole[0].agent_type, AgentType.PEDESTRIAN)
-    )
-    short = straight_road(2, steps=12)
+    road, walking = whole[0].road, np.full_like(whole[0].agent_type, AgentType.PEDESTRIAN)
+    bare = whole[0].replace(segment_id="bare", road=replace(road, boundary=road.boundary.of([])))
+    walkers, short = whole[0].replace(segment_id="walkers", agent_type=walking), straight_road(2, steps=12)
     fill(tmp_path / "store", [bare, whole[0], walkers, short, whole[1]])
-    agent, store = load_agent("constant_velocity"), SegmentStore(tmp_path / "store")
-    settings = replace(PLAIN, workers=workers)
-    found = evaluate_wosac(agent, store, range(5), settings, baselines=False)
+    agent, store, done = load_agent(RANDOM), SegmentStore(tmp_path / "store"), []
+
+    def evaluated(items: Any, seed: int = 0, workers: int = 1, **changes: Any) -> Any:
+        settings = replace(PLAIN, workers=workers, seed=seed)
+        changes |= {"baselines": False, "progress": lambda *at: done.append(at)}
+        return evaluate_wosac(agent, store, items, settings, **changes)
+
+    found = evaluated(range(5))
     assert found.segments == [whole[0].segment_id, whole[1].segment_id]
     assert [skip.segment for skip in found.left_out] == ["bare", "walkers", short.segment_id]
-    alone = evaluate_wosac(agent, store, [1, 4], settings, baselines=False)
-    assert found.numbers("constant_velocity") == alone.numbers("constant_velocity")
     assert [entry["segment"] for entry in found.record()["left_out"]] == ["bare", "walkers", short.segment_id]
-    with pytest.raises(DataError, match="no road edge"):
-        evaluate_wosac(agent, store, range(5), settings, baselines=False, strict=True)
-    with pytest.raises(DataError, match="time_to_collision"):
-        evaluate_wosac(agent, store, [2, 0], settings, baselines=False)
-
-
-def test_processes_change_nothing(tmp_path: Path) -> None:
-    fill(tmp_path / "store", [crossing(num_agents=2, seed=k) for k in range(2)])
-    agent, store = load_agent(RANDOM), SegmentStore(tmp_path / "store")
-    done: list[tuple[int, int]] = []
-
-    def found(workers: int, seed: int = 0) -> Any:
-        settings = replace(PLAIN, workers=workers, seed=seed)
-        evaluation = evaluate_wosac(
-            agent, store, [0, 1], settings, progress=lambda *at: done.append(at), baselines=False
-        )
-        return evaluation.record()["agents"][RANDOM]["segments"]
-
-    assert found(1) == found(2) != found(1, seed=1)
-    assert done == [(1, 2), (2, 2)] * 3
+    assert done == [(k, 5) for k in range(1, 6)]
+    others = [evaluated([1, 4], workers=2), evaluated([1, 4], seed=1)]
+    assert [found.numbers(RANDOM) == other.numbers(RANDOM) for other in others] == [True, False]
+    for items, strict, config, text in (
+        (range(5), True, "2025", "no road edge"),
+        ([2, 0], False, "2025", "time_to_collision"),
+        ([], False, "2025", "no run segments"),
+        ([0], False, "2023", "config must be one of"),
+    ):
+        with pytest.raises(SymphonyError, match=text):
+            evaluated(items, strict=strict, config=config)
 
 
 # --- `symphony evaluate --metrics wosac` and tables ---
@@ -242,13 +222,9 @@ def test_the_table_of_scores(
             wosac_table([alone, other])
     with pytest.raises(ConfigError, match="1 names for 2 records"):
         wosac_table([alone, alone], ["x"])
+    tree = {"search": "tree", "branches": 4, "rule": "best", "prune_every": 10, "logged_goals": True}
+    assert how_in_words(tree) == "32 trees of 4, best every 10, logged goals"
     for text in ("{}", "[]", "nothing", json.dumps({"agent": "a", "agents": {"b": {}}})):
         two.write_text(text)
         with pytest.raises(DataError, match=r"two\.json: not a record of symphony wosac evaluate"):
             read_wosac(two)
-
-
-def test_words() -> None:
-    tree = {"search": "tree", "branches": 4, "rule": "best", "prune_every": 10, "logged_goals": True}
-    assert how_in_words(tree) == "32 trees of 4, best every 10, logged goals"
-    assert how_in_words({"search": "best", "branches": 8, "score": "rule"}) == "the best of 8, by rule"

@@ -93,22 +93,14 @@ def unit(file: Path) -> Arrays:
         return dict(archive)
 
 
-def tensors(arrays: Arrays) -> dict[str, torch.Tensor]:
-    return {name: torch.from_numpy(array) for name, array in arrays.items()}
-
-
-def lines(points: NDArray[Any], counts: NDArray[Any]) -> list[NDArray[Any]]:
-    return np.split(points, np.cumsum(counts)[:-1])
-
-
 def config(entry: dict[str, Any]) -> WosacConfig:
     """Components of a configuration of the official scorer, which all have our pseudocounts."""
-    parts = {}
-    for name, part in entry.items():
-        h = part["histogram"] if part["estimator"] == "histogram" else None
-        bins = None if h is None else (h["min_val"], h["max_val"], h["num_bins"])
-        parts[name] = Component(part["metametric_weight"], bins)
-    return parts
+    bins = {
+        name: tuple(part["histogram"][key] for key in ("min_val", "max_val", "num_bins"))
+        for name, part in entry.items()
+        if part["estimator"] == "histogram"
+    }
+    return {name: Component(part["metametric_weight"], bins.get(name)) for name, part in entry.items()}
 
 
 def test_features(case: tuple[str, Arrays, WosacFeatures]) -> None:
@@ -145,30 +137,24 @@ def test_scores(case: tuple[str, Arrays, WosacFeatures], manifest: dict[str, Any
         assert found[bucket] == pytest.approx(expected["buckets"][bucket], abs=1e-3), bucket
 
 
-@pytest.mark.parametrize("year", CONFIGS)
-def test_configuration(manifest: dict[str, Any], year: str) -> None:
-    expected = config(manifest["configs"][CONFIGS[year]])
-    for name, part in CHALLENGES[year].items():
-        assert part.weight == pytest.approx(expected[name].weight, rel=1e-6)
-        assert (part.bins or ()) == pytest.approx(expected[name].bins or (), rel=1e-6)
-
-
-def test_bin_edges(manifest: dict[str, Any]) -> None:
-    checked = 0
-    for entry in manifest["configs"].values():
-        for part in entry.values():
-            if h := part.get("histogram"):
-                edges = bin_edges((h["min_val"], h["max_val"], h["num_bins"]))
-                equal(edges, np.array(h["edges_float32"], np.float32))
-                checked += 1
-    assert checked == 35
+def test_configurations_and_their_bins(manifest: dict[str, Any]) -> None:
+    for year, name in CONFIGS.items():
+        expected = config(manifest["configs"][name])
+        for part, mine in CHALLENGES[year].items():
+            assert mine.weight == pytest.approx(expected[part].weight, rel=1e-6)
+            assert (mine.bins or ()) == pytest.approx(expected[part].bins or (), rel=1e-6)
+    parts = [part for entry in manifest["configs"].values() for part in entry.values()]
+    histograms = [part["histogram"] for part in parts if part.get("histogram")]
+    assert len(histograms) == 35
+    for h in histograms:
+        edges = bin_edges((h["min_val"], h["max_val"], h["num_bins"]))
+        equal(edges, np.array(h["edges_float32"], np.float32))
 
 
 def test_kinematics(folder: Path) -> None:
     expected = unit(folder / "unit_kinematics.npz")
-    given = tensors(expected)
-    linear = speed(given["x"], given["y"], given["z"])
-    turning, turning_change = angular(given["heading"])
+    given = {name: torch.from_numpy(array) for name, array in expected.items()}
+    linear, (turning, turning_change) = speed(given["x"], given["y"], given["z"]), angular(given["heading"])
     found = {
         "linear_speed": linear,
         "linear_acceleration": central_difference(linear) / 0.1,
@@ -204,42 +190,28 @@ def scored_first(arrays: Arrays, names: tuple[str, ...]) -> tuple[dict[str, torc
     return {name: torch.from_numpy(arrays[name][order][None]) for name in names}, int(mask.sum())
 
 
-def test_box_scene(folder: Path) -> None:
+def test_boxes_of_a_scene(folder: Path) -> None:
     arrays = unit(folder / "unit_box_scene_distance.npz")
     given, count = scored_first(arrays, ("boxes", "valid"))
     each = given["boxes"]
     boxes = Boxes(each[..., :2], each[..., 6], each[..., 3:5], given["valid"], each[..., 0])
-    found = distance_to_nearest(boxes, count)[0]
-    close(found, arrays["dist"], atol=1e-5, rtol=1e-6)
-
-
-def test_time_to_collision(folder: Path) -> None:
+    close(distance_to_nearest(boxes, count)[0], arrays["dist"], atol=1e-5, rtol=1e-6)
     arrays = unit(folder / "unit_time_to_collision.npz")
     given, count = scored_first(arrays, ("x", "y", "length", "width", "heading", "valid"))
-    position = torch.stack((given["x"], given["y"]), -1)
-    size = torch.stack((given["length"], given["width"]), -1)
-    moving = speed(given["x"], given["y"])
-    found = time_to_collision(Boxes(position, given["heading"], size, given["valid"], moving), count)[0]
-    close(found, arrays["ttc"], atol=1e-5)
+    place, size = (torch.stack([given[a], given[b]], -1) for a, b in (("x", "y"), ("length", "width")))
+    boxes = Boxes(place, given["heading"], size, given["valid"], speed(given["x"], given["y"]))
+    close(time_to_collision(boxes, count)[0], arrays["ttc"], atol=1e-5)
 
 
-@pytest.mark.parametrize("stretch", [1, 3])
-def test_road_edges(folder: Path, stretch: int) -> None:
+def test_road_edges(folder: Path, scenario: WosacScenario) -> None:
     arrays = unit(folder / "unit_road_edge.npz")
-    edges = Edges.of(lines(arrays["poly_points"], arrays["poly_n"]))
-    found = signed_distance_to_edges(torch.from_numpy(arrays["query_xyz"]), edges, stretch)
-    close(found, arrays[f"signed_distance_zstretch{stretch}"], atol=1e-5)
-
-
-def test_road_edge_of_boxes(folder: Path) -> None:
-    arrays = unit(folder / "unit_road_edge.npz")
-    edges = Edges.of(lines(arrays["poly_points"], arrays["poly_n"]))
+    edges = Edges.of(np.split(arrays["poly_points"], np.cumsum(arrays["poly_n"])[:-1]))
+    for stretch in (1, 3):
+        found = signed_distance_to_edges(torch.from_numpy(arrays["query_xyz"]), edges, stretch)
+        close(found, arrays[f"signed_distance_zstretch{stretch}"], atol=1e-5)
     boxes, valid = (torch.from_numpy(arrays[name][arrays["evaluated_mask"]]) for name in ("boxes", "valid"))
     found = distance_to_road_edge(boxes[..., :3], boxes[..., 6], boxes[..., 3:6], valid, edges)
     close(found, arrays["box_distance"], atol=1e-5)
-
-
-def test_road_edges_of_a_real_map(folder: Path, scenario: WosacScenario) -> None:
     arrays = unit(folder / f"unit_road_edge_real_{NAME}.npz")
     found = signed_distance_to_edges(torch.from_numpy(arrays["query_xyz"]), Edges.of(scenario.road_edges))
     close(found, arrays["signed_distance"], atol=1e-5)
@@ -262,7 +234,8 @@ def test_nearest_lane_of_a_real_map(folder: Path, scenario: WosacScenario) -> No
 
 def test_red_lights(folder: Path) -> None:
     arrays = unit(folder / "unit_red_light.npz")
-    lanes = Lanes.of(lines(arrays["lane_points"], arrays["lane_n"]), arrays["lane_id"])
+    lines = np.split(arrays["lane_points"], np.cumsum(arrays["lane_n"])[:-1])
+    lanes = Lanes.of(lines, arrays["lane_id"])
     position = torch.from_numpy(np.stack((arrays["x"], arrays["y"]), -1))
     nearest = lanes.nearest(position.reshape(-1, 2))
     equal(lanes.lane[nearest].view(40, 91), arrays["nearest_lane_id"])
@@ -275,20 +248,16 @@ def test_red_lights(folder: Path) -> None:
     equal(found, arrays["violation"])
 
 
-@pytest.mark.parametrize(("name", "scale", "component"), [
-    ("ll_ind", "", "linear_acceleration"), ("ll_angspeed", "scale_for_angspeed", "angular_speed"),
-])  # fmt: skip
-def test_histograms(folder: Path, name: str, scale: str, component: str) -> None:
+def test_estimators(folder: Path) -> None:
     arrays = unit(folder / "unit_estimators.npz")
     assert np.isnan(arrays["sim_values"]).any()
-    factor = arrays[scale] if scale else 1
-    log, simulated = (torch.from_numpy(arrays[n] * factor) for n in ("log_values", "sim_values"))
-    bins = CHALLENGES["2025"][component].bins
-    assert bins is not None
-    close(histogram_log_likelihood(log, simulated, bins), arrays[name], atol=1e-5)
-
-
-def test_flags(folder: Path) -> None:
-    arrays = unit(folder / "unit_estimators.npz")
+    for name, scale, component in (
+        ("ll_ind", 1, "linear_acceleration"),
+        ("ll_angspeed", arrays["scale_for_angspeed"], "angular_speed"),
+    ):
+        log, simulated = (torch.from_numpy(arrays[n] * scale) for n in ("log_values", "sim_values"))
+        bins = CHALLENGES["2025"][component].bins
+        assert bins is not None
+        close(histogram_log_likelihood(log, simulated, bins), arrays[name], atol=1e-5)
     log, simulated = torch.from_numpy(arrays["log_bool"]), torch.from_numpy(arrays["sim_bool"])
     close(flag_log_likelihood(log, simulated), arrays["ll_bernoulli_default"], atol=1e-5)

@@ -1,5 +1,5 @@
-"""The WOSAC score: laws, and numbers worked out by hand. What a plain computation finds of odd scenarios is in
-``test_wosac_odd_scenarios.py``, what the official scorer finds of real ones in ``test_wosac_parity.py``.
+"""The WOSAC score: laws, and numbers worked out by hand. What the official scorer finds is in
+``test_wosac_parity.py``.
 """
 
 from __future__ import annotations
@@ -148,20 +148,11 @@ def test_red_lights_by_hand(runs: bool, change: dict[str, Any]) -> None:
     assert found[0].tolist() == [False, False, runs, False]
 
 
-def test_displacement_counts_the_history_too() -> None:
-    scenario = made_scenario()
-    log = made_rollouts(scenario, 2, noise=0.0)
-    found = score(scenario, replace(log, y=log.y + np.array([3.0, 6.0], np.float32)[:, None, None]))
-    assert found["average_displacement_error"] == pytest.approx(4.5 * 80 / 91, rel=1e-5)
-    assert found["min_ade"] == pytest.approx(3 * 80 / 91, rel=1e-5)
-
-
 def test_playback_has_the_features_of_the_log_and_runs_the_light() -> None:
     scenario = made_scenario()
     features = compute_features(scenario, made_rollouts(scenario, 2, noise=0.0))
-    found = every(features)
-    for name in (name for name in found if name.startswith("log_")):
-        np.testing.assert_array_equal(np.stack([found[name]] * 2), found[name.replace("log_", "sim_")])
+    for name, values in features.log.items():
+        np.testing.assert_array_equal(features.simulated[name], torch.stack([values] * 2), err_msg=name)
     assert features.simulated["traffic_light_violation_per_step"].any(-1).tolist() == [[True, False]] * 2
 
 
@@ -334,16 +325,17 @@ def test_only_vehicles_have_a_time_to_collision_and_run_red_lights() -> None:
 
 
 def test_what_each_object_adds() -> None:
+    """Displacements, which count the history too."""
     scenario = made_scenario()
     log = made_rollouts(scenario, 2, noise=0.0)
-    y = log.y.copy()
-    y[0] += 1.0
-    y[1, 0] += 4.0
-    parts = object_scores(compute_features(scenario, replace(log, y=y)))
+    y = log.y + np.array([[[1.0], [1.0], [0.0], [0.0]], [[4.0], [0.0], [0.0], [0.0]]], np.float32)
+    features = compute_features(scenario, replace(log, y=y))
+    parts = object_scores(features)
     assert [part["object_id"] for part in parts] == [10, 11]
     for name, values in (("average_displacement_error", (2.5, 0.5)), ("min_ade", (1.0, 0.0))):
         expected = [value * 80 / 91 for value in values]
         assert [part[name] for part in parts] == pytest.approx(expected, rel=1e-5, abs=1e-5)
+    assert score_features(features)["min_ade"] == pytest.approx(80 / 91, rel=1e-5)
 
 
 def test_playback_scores_better_than_noise_and_twice_the_same_as_once() -> None:
@@ -360,10 +352,3 @@ def test_means_over_scenarios() -> None:
     scores = [score_features(made_features(seed=seed)) for seed in (0, 1, 2)]
     for name, value in mean_scores(scores).items():
         assert value == pytest.approx(sum(one[name] for one in scores) / 3)
-
-
-def test_errors_name_the_scenario() -> None:
-    scenario = made_scenario()
-    with pytest.raises(DataError) as caught:
-        score(replace(scenario, object_type=np.full(4, 2)), made_rollouts(scenario))
-    assert caught.value.segment == "made"

@@ -128,7 +128,9 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
             changed = [name for name in manifest if manifest[name] != held.get(name)]
             if "settings" in changed and isinstance(held.get("settings"), dict):
                 now, before = manifest["settings"], held["settings"]
-                names = [name for name in {**now, **before} if now.get(name) != before.get(name)]
+                # Folders from before the later settings were kept don't say.
+                names = [name for name in {**now, **before} if name in before or name not in LATER]
+                names = [name for name in names if now.get(name) != before.get(name)]
                 changed = [name for name in changed if name != "settings"] + [f"settings.{n}" for n in names]
             # One that holds nothing yet is nobody's.
             if changed and (_read_index(self.path) or any((self.path / SEGMENTS).glob("*"))):
@@ -287,7 +289,7 @@ def _read_index(path: Path) -> dict[str, Entry]:
     for number, line in enumerate(lines, start=1):
         try:
             entry = from_dict(Entry, json.loads(line))
-        except (ConfigError, ValueError, TypeError, RecursionError) as error:
+        except (ConfigError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise DataError(f"line {number} is damaged ({error})", file=file) from error
         inside = entry.file.startswith(f"{SEGMENTS}/") and entry.file.count("/") == 1
         named = entry.failed is not None or (inside and entry.file.isprintable())
