@@ -30,8 +30,16 @@ import torch
 from symphony.agents import build_agent
 from symphony.agents.agent import FILE, read_spec
 from symphony.agents.checkpoint import load_checkpoint, save_checkpoint
-from symphony.agents.choice import choose, split_name
-from symphony.agents.included import CARD, CARD_FORMAT, FOLDER, PREFIX, read_card, run_folder
+from symphony.agents.choice import (
+    CARD,
+    CARD_FORMAT,
+    FOLDER,
+    PREFIX,
+    choose,
+    read_card,
+    run_folder,
+    split_name,
+)
 from symphony.cli.shared import COLUMNS
 from symphony.config import AgentSpec, EvaluateConfig, TrainConfig, read_json, to_json
 from symphony.data.generate import PRESETS

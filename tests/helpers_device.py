@@ -33,7 +33,7 @@ from torch.utils.backend_registration import (
 )
 
 from symphony.envs import DrivingEnv
-from symphony.geometry import constants
+from symphony.geometry import frames as constants
 
 NAME = "fakegpu"
 

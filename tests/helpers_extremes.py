@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from helpers_segments import crossing, make_road, make_segment, straight_road
-from symphony.data.bounds import (
+from symphony.data.segment import (
     MAX_COORDINATE,
     MAX_DT,
     MAX_HEADING,
@@ -19,8 +19,10 @@ from symphony.data.bounds import (
     MAX_SPEED,
     MIN_DT,
     MIN_SIZE,
+    AgentType,
+    RunSegment,
+    SignalState,
 )
-from symphony.data.segment import AgentType, RunSegment, SignalState
 
 STEPS = 5
 

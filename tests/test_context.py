@@ -10,10 +10,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from helpers_segments import along, crossing, hide, make_road, make_segment, straight_road
-from symphony.data import context as contexts
-from symphony.data.context import CONFLICT_GAP, Context, relations
+from symphony.data import selection as contexts
 from symphony.data.segment import RunSegment
-from symphony.data.selection import choices, interactive_choice
+from symphony.data.selection import CONFLICT_GAP, Context, choices, interactive_choice, relations
 
 STEPS, DT = 51, 0.2
 TIME = np.arange(STEPS) * DT

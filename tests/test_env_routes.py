@@ -37,7 +37,7 @@ from symphony.envs.routes import (
 )
 from symphony.errors import DataWarning
 from symphony.geometry.boxes import box_gap
-from symphony.geometry.stations import stations_along
+from symphony.geometry.polylines import stations_along
 from symphony.roadgraph import LaneGraph
 from symphony.roadgraph.assign import LATERAL
 from test_env import actions, moved, run

@@ -10,7 +10,7 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from symphony.data.context import relations
+from symphony.data.selection import relations
 from symphony.metrics import order_statistics, passing_gap
 from symphony.metrics.order import REACH
 from test_context import CASES, scene

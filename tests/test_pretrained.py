@@ -17,7 +17,7 @@ import torch
 
 from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
-from symphony.agents import included as pretrained
+from symphony.agents import choice as pretrained
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import checkpoints, parts_of
 from symphony.agents.choice import choose

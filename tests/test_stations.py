@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from symphony.geometry.stations import NEAR, earliest_pass, stations_along
+from symphony.geometry.polylines import NEAR, earliest_pass, stations_along
 
 Reals = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def test_how_much_is_found_together_changes_nothing(monkeypatch: pytest.MonkeyPa
     valid = rng.random((3, 21)) < 0.8
     whole = stations_along(lines, path, valid)
     for distances in (1, 4 * 3 * 39):
-        monkeypatch.setattr("symphony.geometry.stations._TOGETHER", distances)
+        monkeypatch.setattr("symphony.geometry.polylines._TOGETHER", distances)
         np.testing.assert_array_equal(stations_along(lines, path, valid), whole)
 
 

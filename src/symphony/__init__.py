@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from symphony.envs.driving import DrivingEnv as DrivingEnv
     from symphony.envs.observation import ObservationConfig as ObservationConfig
     from symphony.evaluation.evaluator import evaluate as evaluate
-    from symphony.objectives.bc import BCLoss as BCLoss
+    from symphony.objectives.base import BCLoss as BCLoss
+    from symphony.objectives.base import DistillationLoss as DistillationLoss
     from symphony.objectives.discriminator import DiscriminatorLoss as DiscriminatorLoss
-    from symphony.objectives.distillation import DistillationLoss as DistillationLoss
     from symphony.objectives.goal import GoalLoss as GoalLoss
     from symphony.objectives.mgail import MGAILLoss as MGAILLoss
     from symphony.recipes import train as train

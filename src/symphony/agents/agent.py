@@ -12,8 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from symphony.agents.checkpoint import CheckpointError, load_checkpoint
-from symphony.agents.choice import choose, split_name
-from symphony.agents.included import PREFIX
+from symphony.agents.choice import PREFIX, choose, split_name
 from symphony.agents.networks import (
     discriminator_network,
     dynamics_of,

@@ -1,7 +1,9 @@
-"""Which checkpoint of a run is its agent: the best by validation, the last, or one that is named."""
+"""Which checkpoint of a run is its agent: the best by validation, the last, or one that is named; included agents."""
 
 from __future__ import annotations
 
+import difflib
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from symphony.agents.checkpoint import MANIFEST, CheckpointError, checkpoints, load_checkpoint
-from symphony.agents.included import is_pretrained, pretrained_folder
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, DataError
 
 
 @dataclass(frozen=True)
@@ -95,3 +96,60 @@ def choose(folder: Path, which: str = "") -> Path:
     if best.step not in steps:
         raise CheckpointError(f"the best checkpoint, of step {best.step}, is gone; {held}", file=folder)
     return steps[best.step]
+
+
+PREFIX = "pretrained:"
+"""Names of these agents begin with it."""
+FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
+CARD = "card.json"
+"""Model card in an agent's folder."""
+CARD_FORMAT = 1
+"""Version of such a card."""
+
+
+def is_pretrained(name: str) -> bool:
+    """Whether a name is meant to be that of an agent that comes with the package."""
+    return name.startswith(PREFIX)
+
+
+def pretrained_names() -> list[str]:
+    """All there are, without prefix."""
+    return sorted(path.parent.name for path in FOLDER.glob("*/agent.json"))
+
+
+def pretrained_folder(name: str) -> Path:
+    """The folder of ``pretrained:NAME``.
+
+    Raises:
+        ConfigError: if there is none of that name; says which there are.
+    """
+    wanted, names = name.removeprefix(PREFIX), pretrained_names()
+    if wanted not in names:
+        close = difflib.get_close_matches(wanted, names, 1)
+        hint = f"did you mean '{PREFIX}{close[0]}'? " if close else ""
+        known = ", ".join(PREFIX + known for known in names) or "none"
+        raise ConfigError(f"no agent '{name}' comes with this package; {hint}there are: {known}")
+    return FOLDER / wanted
+
+
+def run_folder(run: Path) -> Path:
+    """The folder that is meant where one of a run is asked for: itself, or that of ``pretrained:NAME``.
+
+    Raises:
+        ConfigError: if there is no such agent.
+    """
+    return pretrained_folder(str(run)) if is_pretrained(str(run)) else run
+
+
+def read_card(folder: Path) -> dict[str, Any]:
+    """The model card in the folder of an agent: ``name``, ``method``, ``about``, ``training``, ``settings``,
+    ``scores`` (one for each data set it was evaluated on) and ``limits``.
+
+    Raises:
+        DataError: there is none.
+    """
+    file = folder / CARD
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise DataError("the agent has no model card", file=file) from error

@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import Any
 
 from symphony.data import joins, overlaps, store_format
-from symphony.data.bounds import MAX_AGENTS, MAX_DT, MIN_DT
 from symphony.data.parts import ODD, Preparation, make_part, tasks_of
 from symphony.data.report import Report, Skip
 from symphony.data.resample import MAX_SIGMA
+from symphony.data.segment import MAX_AGENTS, MAX_DT, MIN_DT
 from symphony.data.sources import Reader, get_reader
 from symphony.data.store import TWICE, SegmentStore
 from symphony.data.store_writer import StoreWriter

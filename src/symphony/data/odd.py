@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.bounds import (
+from symphony.data.segment import (
     MAX_COORDINATE,
     MAX_HEADING,
     MAX_HEIGHT,
@@ -17,8 +17,13 @@ from symphony.data.bounds import (
     MAX_SIZE,
     MAX_SPEED,
     MIN_SIZE,
+    STATES,
+    Bools,
+    Polylines,
+    RunSegment,
+    jumps,
+    largest,
 )
-from symphony.data.segment import STATES, Bools, Polylines, RunSegment, jumps, largest
 from symphony.data.subset import lines_of, with_agents, with_lanes
 
 LATE = 1.0
@@ -41,7 +46,7 @@ def mended(segment: RunSegment) -> RunSegment:
     """What remains of a segment that breaks the schema once single agents, states and lines are left out.
 
     Left out are agents without a size, or of 100 m and more; states that are not finite or beyond
-    :mod:`symphony.data.bounds`, and of a track that jumps those a jump away from its longest piece; lines of the map
+    :mod:`symphony.data.segment`, and of a track that jumps those a jump away from its longest piece; lines of the map
     with such points. The ego stays, so that the result may still break the schema.
     """
     return _agents(_states(_lines(segment)))

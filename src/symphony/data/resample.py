@@ -10,9 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.bounds import MAX_DT, MIN_DT, check_counts
 from symphony.data.odd import noted
-from symphony.data.segment import STATES, Ints, RunSegment, SignalState, validate, wrap
+from symphony.data.segment import (
+    MAX_DT,
+    MIN_DT,
+    STATES,
+    Ints,
+    RunSegment,
+    SignalState,
+    check_counts,
+    validate,
+    wrap,
+)
 from symphony.errors import ConfigError
 
 Doubles = NDArray[np.float64]

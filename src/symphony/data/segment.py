@@ -17,8 +17,43 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data import bounds
 from symphony.errors import DataError
+
+MAX_COORDINATE = 20_000.0  # metres from the origin, beyond which float32 no longer resolves a millimetre
+MAX_HEIGHT = 10_000.0  # metres above or below the origin
+MAX_ORIGIN = 1e8  # metres; map projections count in the millions
+MIN_DT, MAX_DT = 0.005, 5.0  # seconds per step
+MAX_SPEED = 350.0  # m/s; nothing on wheels was ever faster
+MAX_JUMP = 1000.0  # metres from one step to the next
+MIN_SIZE, MAX_SIZE = 0.05, 100.0  # metres of a box's side
+MAX_HEADING = 1000.0  # radians: headings need not be wrapped, but nobody turns that often
+MAX_WIDTH = 1000.0  # metres of a lane
+MAX_NAME = 200  # characters of a segment's id, its source, its group and the name of its file
+
+MAX_STEPS = 10_000  # a quarter of an hour at 10 Hz
+MAX_AGENTS = 5_000
+MAX_STATES = 2_000_000  # agents times steps
+MAX_POINTS = 1_000_000  # of a map
+MAX_LENGTH = 5e6  # metres of all lines of a map
+MAX_FILE = 64 << 20  # bytes of a file that is read as a whole (CommonRoad, Argoverse 2)
+
+
+def check_counts(agents: int, steps: int, field: str) -> None:
+    """Refuse more agents or steps than a segment may have before room is made for them; the error names ``field``."""
+    for count, most, what in (
+        (steps, MAX_STEPS, "steps"),
+        (agents, MAX_AGENTS, "agents"),
+        (agents * steps, MAX_STATES, "states (agents times steps)"),
+    ):
+        if count > most:
+            raise DataError(f"{count} {what}, at most {most} are read: cut the log", field=field)
+
+
+def check_signals(lights: int, steps: int, field: str) -> None:
+    """Refuse more states of traffic lights than can be read; the error names ``field``."""
+    if lights * steps > 10 * MAX_STATES:
+        raise DataError(f"{lights} lights at {steps} steps, too many to read", field=field)
+
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
@@ -252,16 +287,16 @@ def _checks(s: RunSegment) -> Iterator[Check]:
     # The counts come before anything that is slow on large arrays.
     points = sum(len(lines.points) for lines in (s.road.lanes, s.road.boundary, s.road.marks))
     for name, count, least, most, what in (
-        ("valid", steps, 2, bounds.MAX_STEPS, "steps"),
-        ("agent_id", agents, 1, bounds.MAX_AGENTS, "agents"),
-        ("valid", agents * steps, 1, bounds.MAX_STATES, "states"),
-        ("road", points, 0, bounds.MAX_POINTS, "map points"),
+        ("valid", steps, 2, MAX_STEPS, "steps"),
+        ("agent_id", agents, 1, MAX_AGENTS, "agents"),
+        ("valid", agents * steps, 1, MAX_STATES, "states"),
+        ("road", points, 0, MAX_POINTS, "map points"),
     ):
         fits = least <= count <= most or s.valid.ndim != 2
         yield name, fits, f"{count} {what}, allowed are {least} to {most}"
     for name in ("segment_id", "source", "file", "group"):
         text = getattr(s, name)
-        yield name, len(text) <= bounds.MAX_NAME, f"{len(text)} characters, at most {bounds.MAX_NAME}"
+        yield name, len(text) <= MAX_NAME, f"{len(text)} characters, at most {MAX_NAME}"
         yield name, not text or text.isprintable(), "holds characters that can't be printed"
     yield "valid", s.valid.dtype == np.bool_ and s.valid.shape == (agents, steps), "must be bool [A, T]"
     yield from _array("agent_id", s.agent_id, (agents,), np.int64)
@@ -272,7 +307,7 @@ def _checks(s: RunSegment) -> Iterator[Check]:
     yield from _array("heading", s.heading, (agents, steps), np.float32)
     yield from _array("velocity", s.velocity, (agents, steps, 2), np.float32)
     far = largest(s.position[..., :2])
-    yield "position", far < bounds.MAX_COORDINATE, f"{far:.0f} m from the origin: not re-centred"
+    yield "position", far < MAX_COORDINATE, f"{far:.0f} m from the origin: not re-centred"
     yield "ego", 0 <= s.ego < agents, f"index {s.ego} outside the {agents} agents"
     yield "ego", bool(s.valid[s.ego].any()), "the ego is valid at no step"
     yield from _road_checks(s.road)
@@ -283,17 +318,17 @@ def _checks(s: RunSegment) -> Iterator[Check]:
     yield from _array("predict", s.predict, (len(s.predict),), np.int32, agents)
     yield from _array("origin", s.origin, (3,), np.float64)
     yield "current_step", 0 <= s.current_step < steps, f"{s.current_step} outside the {steps} steps"
-    sides = bounds.MIN_SIZE, bounds.MAX_SIZE
+    sides = MIN_SIZE, MAX_SIZE
     plausible: tuple[tuple[str, float, float, float, float, str], ...] = (
-        ("dt", s.dt, s.dt, bounds.MIN_DT, bounds.MAX_DT, "s"),
+        ("dt", s.dt, s.dt, MIN_DT, MAX_DT, "s"),
         ("size", s.size[:, :2].min(), largest(s.size), *sides, "m: length and width must be positive"),
-        ("size", s.size[:, 2].min(), 0, 0, bounds.MAX_SIZE, "m of height"),
-        ("velocity", 0, largest(s.velocity), 0, bounds.MAX_SPEED, "m/s"),
-        ("heading", 0, largest(s.heading), 0, bounds.MAX_HEADING, "rad"),
-        ("position", 0, float(jumps(s).max(initial=0)), 0, bounds.MAX_JUMP, "m in a step"),
-        ("position", 0, largest(s.position[..., 2]), 0, bounds.MAX_HEIGHT, "m of height"),
-        ("signal_point", 0, largest(s.signal_point), 0, bounds.MAX_COORDINATE, "m from the origin"),
-        ("origin", 0, largest(s.origin), 0, bounds.MAX_ORIGIN, "m"),
+        ("size", s.size[:, 2].min(), 0, 0, MAX_SIZE, "m of height"),
+        ("velocity", 0, largest(s.velocity), 0, MAX_SPEED, "m/s"),
+        ("heading", 0, largest(s.heading), 0, MAX_HEADING, "rad"),
+        ("position", 0, float(jumps(s).max(initial=0)), 0, MAX_JUMP, "m in a step"),
+        ("position", 0, largest(s.position[..., 2]), 0, MAX_HEIGHT, "m of height"),
+        ("signal_point", 0, largest(s.signal_point), 0, MAX_COORDINATE, "m from the origin"),
+        ("origin", 0, largest(s.origin), 0, MAX_ORIGIN, "m"),
     )
     for name, low, high, lowest, highest, unit in plausible:
         fits = lowest <= low and high <= highest
@@ -309,7 +344,7 @@ def _road_checks(road: RoadMap) -> Iterator[Check]:
     yield from _array("road.lane_id", road.lane_id, (lanes,), np.int64)
     yield "road.lane_id", len(np.unique(road.lane_id)) == lanes, "ids are not unique"
     yield from _array("road.lane_type", road.lane_type, (lanes,), np.uint8, len(LaneType))
-    for name, most in (("speed_limit", bounds.MAX_SPEED), ("lane_width", bounds.MAX_WIDTH)):
+    for name, most in (("speed_limit", MAX_SPEED), ("lane_width", MAX_WIDTH)):
         array = getattr(road, name)
         yield f"road.{name}", array.shape == (lanes,) and array.dtype == np.float32, "must be float32 [L]"
         fits = np.isnan(array) | ((array > 0) & (array <= most))
@@ -319,7 +354,7 @@ def _road_checks(road: RoadMap) -> Iterator[Check]:
         yield from _array(f"road.{name}", array, (len(array), 2), np.int32, lanes)
     yield from _array("road.mark_type", road.mark_type, (len(road.marks),), np.uint8, len(MarkType))
     length = sum(line_lengths(lines).sum() for lines in (road.lanes, road.boundary, road.marks))
-    yield "road", length <= bounds.MAX_LENGTH, f"{length:.4g} m of lines, at most {bounds.MAX_LENGTH:g}"
+    yield "road", length <= MAX_LENGTH, f"{length:.4g} m of lines, at most {MAX_LENGTH:g}"
 
 
 def _polylines(name: str, lines: Polylines, least: int) -> Iterator[Check]:
@@ -332,8 +367,8 @@ def _polylines(name: str, lines: Polylines, least: int) -> Iterator[Check]:
     yield name, len(short) == 0, f"line {short[:1]} has fewer than {least} points"
     yield from _array(name, lines.points, (len(lines.points), 3), np.float32)
     far, height = largest(lines.points[:, :2]), largest(lines.points[:, 2])
-    fits = far <= bounds.MAX_COORDINATE and height <= bounds.MAX_HEIGHT
-    most = f"at most {bounds.MAX_COORDINATE:g} and {bounds.MAX_HEIGHT:g}"
+    fits = far <= MAX_COORDINATE and height <= MAX_HEIGHT
+    most = f"at most {MAX_COORDINATE:g} and {MAX_HEIGHT:g}"
     yield name, fits, f"{far:.4g} m from the origin or {height:.4g} m of height, {most}"
 
 

@@ -4,14 +4,203 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.context import Context, relations
-from symphony.data.segment import AgentType, RunSegment, line_lengths
+from symphony.data.segment import AgentType, Bools, RunSegment, line_lengths, wrap
 from symphony.errors import DataError
+
+Reals = NDArray[np.floating[Any]]
+Rows = NDArray[np.integer[Any]]
+
+HALF_LANE, APART = 1.5, 2.5
+"""Metres sideways within which two paths are one, and from which on they are in different lanes before that."""
+SAME_WAY = np.deg2rad(30)
+"""Heading difference below which two vehicles at the same place go the same way; up to 150 degrees they cross."""
+SHARED, LOOKBACK = 5.0, 50.0
+"""Metres of path two vehicles must have in common, and before the place where two become one that are compared."""
+TIME_GAP = 3.0
+"""Seconds between two vehicles at the same place within which one follows the other."""
+CONFLICT_GAP = 4.0
+"""Seconds between two vehicles at the place where their paths cross or become one within which they interact.
+Between two customary limits: 3 s on the difference in time to the conflict point (INTERACTION data set, Zhan et al.,
+2019, arXiv:1910.03088) and 5 s on the post-encroachment time (SSAM, FHWA-HRT-08-051, 2008)."""
+QUEUE_SPEED, KEPT = 5.0, 1.0
+"""m/s at which ``TIME_GAP`` is the distance of slower vehicles, and seconds for which it must be kept in one lane."""
+TILE = 1_000_000
+"""Pairs of steps that are compared at a time."""
+
+
+class Context(StrEnum):
+    """Why the partner of the ego was chosen; the later ones say what it is to the ego. Best first."""
+
+    INTEREST = "interest"  # the source marks it as interacting (WOMD: objects of interest)
+    PREDICT = "predict"  # the source marks it for prediction (WOMD: tracks to predict)
+    MERGE = "merge"  # both come into one lane from different lanes, shortly after each other
+    CROSSING = "crossing"  # the paths cross, and the two pass there shortly after each other
+    LEADER = "leader"  # it drives ahead on the ego's path, a short time gap away
+    FOLLOWER = "follower"  # it drives behind on the ego's path, a short time gap away
+    NEAREST = "nearest"  # none of these: the nearest that moves
+
+
+class Relations(NamedTuple):
+    """What each of K vehicles is to the ego: seconds [K] between the two, infinite where it is not.
+
+    Where their paths become one, where they cross, the smallest time gap to it and from it on the path in common.
+    """
+
+    merge: Reals
+    crossing: Reals
+    leader: Reals
+    follower: Reals
+
+
+def relations(segment: RunSegment, others: Rows) -> Relations:
+    """Relate vehicles [K] to the ego, which is none of them, by the paths that were logged."""
+    merge, crossing = np.full(len(others), np.inf), np.full(len(others), np.inf)
+    leader, follower = _queue_gap(segment, others, -1), _queue_gap(segment, others, 1)
+    rows = np.flatnonzero(_boxes_meet(segment, others))
+    if len(rows):
+        meeting = _Meeting(segment, others[rows])
+        together = meeting.shared @ meeting.spacing >= SHARED
+        for on_path, field in ((meeting.before, leader), (meeting.after, follower)):
+            field[rows] = np.minimum(np.where(together, on_path, np.inf), field[rows])
+        # Two paths that become one, or stop being one, cross on the way: those relations have their own names.
+        apart = ~meeting.shared.any(1)
+        crossing[rows[apart]] = meeting.crossing[apart]
+        for k in np.flatnonzero(together & (np.minimum(meeting.before, meeting.after) <= CONFLICT_GAP)):
+            merge[rows[k]] = _merge_gap(segment, int(others[rows[k]]), *meeting.first[k].tolist())
+    limits = ((merge, CONFLICT_GAP), (crossing, CONFLICT_GAP), (leader, TIME_GAP), (follower, TIME_GAP))
+    return Relations(*(np.where(gaps <= limit + 1e-6, gaps, np.inf) for gaps, limit in limits))
+
+
+class _Meeting:
+    """K vehicles and the ego, each of T steps with each: found a tile at a time, as T squared may be large.
+
+    Attributes:
+        spacing: [T] metres the ego drives in a step, half before and half after it.
+        shared: [K, T] whether the other, at some step, is where the ego is at this one, going the same way.
+        first: [K, 2] the ego's first such step, and the other's step nearest along it; 0 where there is none.
+        before, after: [K] smallest time in seconds by which the other is there before or after the ego.
+        crossing: [K] smallest time in seconds between the two at a place where they pass at an angle.
+    """
+
+    def __init__(self, segment: RunSegment, others: Rows) -> None:
+        agents, steps = len(others), segment.num_steps
+        self.spacing = _spacing(segment.position[segment.ego, :, :2], segment.valid[segment.ego])
+        self.shared, self.first = np.zeros((agents, steps), bool), np.zeros((agents, 2), np.int64)
+        self.before, self.after, self.crossing = (np.full(agents, np.inf) for _ in range(3))
+        rows = max(TILE // steps, 1)
+        group = max(rows // steps, 1)
+        for a in range(0, agents, group):
+            for t in range(0, steps, rows):
+                self._add(segment, others, slice(a, a + group), slice(t, t + rows))
+
+    def _add(self, segment: RunSegment, others: Rows, group: slice, steps: slice) -> None:
+        """Look at some of the others [k] and some of the ego's steps [t]."""
+        along, shared, crossing = _places(segment, others[group], steps, self.spacing[steps])
+        time = np.arange(segment.num_steps) * segment.dt
+        # From the ego's step to the other's; negative where that is there first.
+        gap = time - time[steps, None]
+        for field, where, value in (
+            (self.before, shared & (gap < 0), -gap),
+            (self.after, shared & (gap > 0), gap),
+            (self.crossing, crossing, np.abs(gap)),
+        ):
+            field[group] = np.minimum(field[group], np.where(where, value, np.inf).min((1, 2)))
+        there = np.asarray(shared.any(axis=2))
+        new = np.flatnonzero(there.any(axis=1) & ~self.shared[group].any(axis=1))
+        mine = there[new].argmax(1)
+        theirs = np.where(shared[new, mine], along[new, mine], np.inf).argmin(1)
+        self.first[group][new] = np.stack([steps.start + mine, theirs], -1)
+        self.shared[group, steps] = there
+
+
+def _places(segment: RunSegment, others: Rows, steps: slice, spacing: Reals) -> tuple[Reals, Bools, Bools]:
+    """Each of the ego's steps [t] with each of the others' [k, t, T].
+
+    Gives metres the ego is ahead, whether both are at one place the same way, and whether both are there at an angle.
+    """
+    ego, position = segment.ego, segment.position[..., :2]
+    delta = position[ego, None, steps, None] - position[others][:, None]
+    heading = segment.heading[others]
+    along, aside = map(np.abs, _turned(delta, heading[:, None]))
+    turn = np.abs(wrap(segment.heading[ego, None, steps, None] - heading[:, None]))
+    theirs = _spacing(position[others], segment.valid[others])[:, None]
+    both = segment.valid[ego, None, steps, None] & segment.valid[others][:, None]
+    # A place lies between two logged steps as a rule: half the way to the next one is added.
+    both &= along <= theirs / 2 + 0.5
+    shared = both & (turn < SAME_WAY) & (aside <= HALF_LANE)
+    crosses = (turn >= SAME_WAY) & (turn <= np.pi - SAME_WAY)
+    return along, shared, both & crosses & (aside <= spacing[:, None] / 2 + 0.5)
+
+
+def _turned(delta: Reals, heading: Reals) -> tuple[Reals, Reals]:
+    """Parts of vectors [..., 2] along headings and to their left."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    return cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]
+
+
+def _spacing(position: Reals, valid: Bools) -> Reals:
+    """[..., T] half the way from the step before plus half the way to the next, in metres."""
+    sides = np.linalg.norm(np.diff(position, axis=-2), axis=-1)
+    sides = np.where(valid[..., 1:] & valid[..., :-1], sides, 0)
+    padded = np.concatenate([sides[..., :1], sides, sides[..., -1:]], -1)
+    return (padded[..., 1:] + padded[..., :-1]) / 2
+
+
+def _boxes_meet(segment: RunSegment, others: Rows) -> Bools:
+    """[K] whether the boxes around the two paths come close: cheap, and leaves few."""
+    position, valid = segment.position[..., :2], segment.valid[..., None]
+    rows = np.append(others, segment.ego)
+    low = np.where(valid[rows], position[rows], np.inf).min(1) - HALF_LANE
+    high = np.where(valid[rows], position[rows], -np.inf).max(1) + HALF_LANE
+    return ((low[:-1] <= high[-1]) & (low[-1] <= high[:-1])).all(1)
+
+
+def _queue_gap(segment: RunSegment, others: Rows, sign: int) -> Reals:
+    """[K] smallest time gap kept for a while by two in one lane at the same step; infinite if they don't.
+
+    In a queue, paths in common are too short to tell and time gaps grow without limit: there the distance counts,
+    as if the one behind drove ``QUEUE_SPEED``. The sign is -1 for those ahead of the ego, 1 for those behind it.
+    """
+    ego, heading = segment.ego, segment.heading[others]
+    delta = sign * (segment.position[ego, :, :2] - segment.position[others, :, :2])
+    along, aside = _turned(delta, heading)
+    speed = np.linalg.norm(segment.velocity[[ego] if sign < 0 else others], axis=-1)
+    gap = along / np.maximum(speed, QUEUE_SPEED)
+    turn = np.abs(wrap(segment.heading[ego] - heading))
+    kept = segment.valid[ego] & segment.valid[others] & (along > 0) & (gap <= TIME_GAP)
+    kept &= (np.abs(aside) <= HALF_LANE) & (turn < SAME_WAY)
+    long_enough = kept.sum(1) * segment.dt >= KEPT
+    return np.where(long_enough, np.where(kept, gap, np.inf).min(1), np.inf)
+
+
+def _merge_gap(segment: RunSegment, other: int, mine: int, theirs: int) -> float:
+    """Seconds between the ego and another where their paths become one; infinite if they always were one.
+
+    Both paths are followed backwards from that place by the same distances: they must have been apart or at an angle.
+    """
+    ahead, beside = _way_back(segment, segment.ego, mine), _way_back(segment, other, theirs)
+    back = np.arange(1.0, min(ahead[0][-1], beside[0][-1], LOOKBACK) + 1e-6)
+    ego, partner = (np.stack([np.interp(back, way[0], row) for row in way[1:]]) for way in (ahead, beside))
+    apart = np.hypot(*(ego[:2] - partner[:2])) >= APART
+    if not (apart | (np.abs(wrap(ego[2] - partner[2])) >= 1.5 * SAME_WAY)).any():
+        return np.inf
+    return abs(theirs - mine) * segment.dt
+
+
+def _way_back(segment: RunSegment, agent: int, step: int) -> Reals:
+    """[4, n] distance driven since, x, y and heading at the logged steps from one back to the first."""
+    steps = np.flatnonzero(segment.valid[agent, : step + 1])[::-1]
+    position = segment.position[agent, steps, :2].astype(np.float64)
+    heading = np.unwrap(segment.heading[agent, steps].astype(np.float64))
+    driven = np.append(0, np.cumsum(np.hypot(*np.diff(position, axis=0).T)))
+    return np.stack([driven, *position.T, heading])
+
 
 MAX_PLAYBACK_AGENTS = 256
 MAX_ROAD_POINTS = 10_000
@@ -49,7 +238,7 @@ def interactive_choice(segment: RunSegment, count: int, *, fewer: bool = False) 
 
     First the ego. Then one partner, chosen by context: the nearest of the agents the source marks as interacting,
     else of those it marks for prediction that move, else the one the ego merges with, crosses, follows or leads
-    (:mod:`symphony.data.context`; the one with the smallest time gap, then the nearest), else the nearest that
+    (:mod:`symphony.data.selection`; the one with the smallest time gap, then the nearest), else the nearest that
     moves. Then the nearest that move. All are vehicles seen at the first step; "nearest" is to the ego at that
     step, and agents seen at every step (which can be compared with the log throughout) go before the others, whatever
     their context.

@@ -16,8 +16,16 @@ from typing import Any, SupportsIndex, cast, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.bounds import MAX_AGENTS, MAX_POINTS, MAX_STEPS
-from symphony.data.segment import Polylines, RoadMap, RunSegment, content_hash, validate
+from symphony.data.segment import (
+    MAX_AGENTS,
+    MAX_POINTS,
+    MAX_STEPS,
+    Polylines,
+    RoadMap,
+    RunSegment,
+    content_hash,
+    validate,
+)
 from symphony.data.store_format import MAPS, REPORT, SEGMENTS, Table, check_header, read_json
 from symphony.errors import DataError
 

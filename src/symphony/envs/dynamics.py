@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from symphony.errors import ConfigError
-from symphony.geometry.constants import constant
-from symphony.geometry.frames import rotate, wrap
+from symphony.geometry.frames import constant, rotate, wrap
 
 WHEELBASE = 0.6
 """Wheelbase as a fraction of the box length; the axles lie symmetrically about the centre."""

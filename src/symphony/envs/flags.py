@@ -15,7 +15,7 @@ from symphony.envs.objects import Objects, rows_of
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import Tables
 from symphony.geometry.boxes import boxes_overlap
-from symphony.geometry.levels import levels_apart
+from symphony.geometry.frames import levels_apart
 from symphony.geometry.nearest import on_host, places
 from symphony.geometry.polylines import distance_to, signed_distance
 

@@ -17,9 +17,7 @@ from symphony.envs.routes import RouteWindow, along_route
 from symphony.envs.scene import SceneBatch
 from symphony.envs.tables import AGENT_FEATURES, Tables
 from symphony.geometry.boxes import box_gap, gap_between
-from symphony.geometry.constants import constant
-from symphony.geometry.frames import wrap
-from symphony.geometry.levels import levels_apart
+from symphony.geometry.frames import constant, levels_apart, wrap
 from symphony.geometry.nearest import nearest, places
 
 OBJECT_FEATURES = 8 + AGENT_FEATURES

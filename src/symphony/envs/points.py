@@ -12,7 +12,7 @@ from torch import Tensor
 
 from symphony.envs.objects import Observers, frame
 from symphony.envs.tables import LIGHT_COLUMN, Tables
-from symphony.geometry.levels import levels_apart
+from symphony.geometry.frames import levels_apart
 from symphony.geometry.nearest import nearest, on_host
 
 REPAID = 2

@@ -19,11 +19,9 @@ from torch import Tensor
 
 from symphony.data.segment import RunSegment
 from symphony.errors import DataError, DataWarning
-from symphony.geometry.constants import constant
-from symphony.geometry.frames import rotate
-from symphony.geometry.levels import LEVEL
+from symphony.geometry.frames import LEVEL, constant, rotate
 from symphony.geometry.nearest import on_host
-from symphony.geometry.stations import stations_along
+from symphony.geometry.polylines import stations_along
 from symphony.roadgraph import LaneGraph, ground_truth_routes, route_lines, routes, starting_lanes
 from symphony.roadgraph.routes import HORIZON
 from symphony.streams import stream_of

@@ -16,7 +16,7 @@ from symphony.data.segment import SignalState
 from symphony.evaluation.contacts import Bools, Indices, Reals
 from symphony.evaluation.lanes import Heights, Lanes
 from symphony.geometry import levels_apart
-from symphony.geometry.stations import stations_along
+from symphony.geometry.polylines import stations_along
 from symphony.metrics.kinds import STANDING
 from symphony.roadgraph.lines import line_strings, turn_between
 from symphony.roadgraph.routes import ends_inside
@@ -234,8 +234,8 @@ def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> Progress
 
     It is measured along the route that an agent follows, and beyond its end along the path of the log, where the log
     goes on from there. A route that passes a place twice is followed in order
-    (:func:`symphony.geometry.stations.stations_along`). For an agent that goes on where both end but the map does not
-    it is NaN. Without a route it is the length of the agent's path.
+    (:func:`symphony.geometry.polylines.stations_along`). For an agent that goes on where both end but the map does
+    not it is NaN. Without a route it is the length of the agent's path.
     """
     rows, within = saved.agents[evaluated], slice(saved.start, saved.last + 1)
     there = saved.there[..., evaluated].swapaxes(1, 2)

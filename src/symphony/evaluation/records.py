@@ -15,8 +15,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from symphony.agents.choice import choose, split_name
-from symphony.agents.included import is_pretrained
+from symphony.agents.choice import choose, is_pretrained, split_name
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
 from symphony.files import write_json

@@ -1,11 +1,13 @@
-"""Angles and planar frames. Angles in radians counter-clockwise from +x, any leading dimensions."""
+"""Angles, planar frames and levels of a map, and small constants. Angles in radians counter-clockwise from +x."""
 
 from __future__ import annotations
 
 import math
+from functools import cache
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Num
 from torch import Tensor
 
 
@@ -36,3 +38,28 @@ def with_speed(moving: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 4"]:
     """From x, y, heading and velocity to x, y, heading and speed along the heading."""
     speed = forward_speed(moving[..., 3:], moving[..., 2])
     return torch.cat([moving[..., :3], speed[..., None]], -1)
+
+
+LEVEL = 2.5
+"""Metres of height, at one place, from which on two things are on different levels."""
+
+
+def levels_apart(one: Float[Tensor, "*#b 2"], other: Float[Tensor, "*#b 2"]) -> Bool[Tensor, "*b"]:
+    """Whether two places, by height and level (0 for none), are on two of them."""
+    levels = (one[..., 1] != other[..., 1]) & (one[..., 1] > 0) & (other[..., 1] > 0)
+    return levels & ((one[..., 0] - other[..., 0]).abs() >= LEVEL)
+
+
+def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Num[Tensor, "*_"]:
+    """A tensor of these (nested tuples of) numbers; shared, so never written to."""
+    if torch.compiler.is_compiling():
+        return torch.tensor(values, dtype=dtype, device=device)
+    return made(values, dtype, device)
+
+
+@cache
+def made(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Num[Tensor, "*_"]:
+    """What :func:`constant` keeps."""
+    # Made outside of inference mode, or autograd could not save it.
+    with torch.inference_mode(False), torch.no_grad():
+        return torch.tensor(values, dtype=dtype).to(device)

@@ -1,4 +1,4 @@
-"""Who goes first between agents whose paths merge or cross (see :func:`symphony.data.context.relations`).
+"""Who goes first between agents whose paths merge or cross (see :func:`symphony.data.selection.relations`).
 
 Metres and seconds.
 """

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from symphony.imports import lazily
-from symphony.modules.discriminator import Discriminator, discriminator
 
 if TYPE_CHECKING:
     from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from symphony.modules.goals import RouteScores, drawn_goals, goal_policy
     from symphony.modules.policy import NoiseSampler, SeededNoise, discrete_policy, inverse_cdf
     from symphony.modules.pooling import pool_elements
+    from symphony.modules.realism import Discriminator, discriminator
 
 __all__ = [
     "FORESIGHT",

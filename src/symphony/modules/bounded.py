@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.distributions import Distribution, Normal, constraints
 
-from symphony.geometry.constants import constant
+from symphony.geometry.frames import constant
 from symphony.modules.policy import inverse_cdf
 
 SMOOTH = 0.02

@@ -9,9 +9,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from symphony.objectives.bc import BCLoss
+    from symphony.objectives.base import BCLoss, DistillationLoss
     from symphony.objectives.discriminator import DiscriminatorLoss
-    from symphony.objectives.distillation import DistillationLoss
     from symphony.objectives.goal import GoalLoss
     from symphony.objectives.mgail import MGAILLoss
     from symphony.objectives.statistics import auc
@@ -23,7 +22,8 @@ def __getattr__(name: str) -> Any:
     """Import what is asked for, and no other loss."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    room = "statistics" if name == "auc" else name.removesuffix("Loss").lower()
+    rooms = {"auc": "statistics", "BCLoss": "base", "DistillationLoss": "base"}
+    room = rooms.get(name, name.removesuffix("Loss").lower())
     return getattr(importlib.import_module(f"{__name__}.{room}"), name)
 
 

@@ -1,14 +1,15 @@
-"""What the losses of this package share: settable keys, masks of the entries that count, reductions."""
+"""What the losses of this package share: settable keys, masks, reductions; and those that imitate actions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int, Num, Shaped
-from tensordict import NestedKey, TensorDictBase, TensorDictParams, unravel_key
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams, unravel_key
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, dispatch
 from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.objectives.common import LossModule
@@ -235,3 +236,137 @@ def _is_categorical(actor: Any) -> bool:
     heads = [m for m in actor.modules() if isinstance(m, ProbabilisticTensorDictModule)]
     kind = heads[-1].distribution_class if heads else None
     return isinstance(kind, type) and issubclass(kind, Categorical)
+
+
+class BCLoss(ActorLoss):
+    """Negative log-likelihood of expert actions under a stochastic actor (paper, II-B).
+
+    Unlike TorchRL's class of this name it takes its distribution from the actor whatever the keys are called,
+    and leaves padded agents out. Also for other labels drawn from a distribution, such as goals.
+
+    Args:
+        actor_network: probabilistic module with a `get_dist`.
+        reduction: `"mean"` over the valid entries (0 if there are none), `"sum"`, or `"none"`, which keeps the
+            shape `[...]` of the log-probability, with zeros at invalid entries.
+        label_smoothing: share of the target spread evenly over all possible categories, in [0, 1); categorical actors
+            only.
+        use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
+
+    Writes `loss_bc`, and for categorical actors, detached, `entropy` of the actor and `accuracy` of its mode
+    (means over the valid entries; without reduction per entry like the loss).
+
+    Raises:
+        KeyError: at the call, if the action or the mask is missing.
+        ValueError: for a bad `label_smoothing` or `reduction`, or an action or a mask of another shape.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that can be set by `.set_keys(name=key)`.
+
+        Attributes:
+            action (NestedKey): the expert's action.
+            valid (NestedKey): bool mask, True where an agent counts.
+        """
+
+        action: NestedKey = ("agents", "action")
+        valid: NestedKey = ("agents", "valid")
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential | ProbabilisticTensorDictModule,
+        *,
+        reduction: Reduction | None = None,
+        label_smoothing: float = 0.0,
+        use_mask: bool | None = None,
+    ) -> None:
+        super().__init__(actor_network, reduction, label_smoothing, use_mask)
+        self.out_keys = ["loss_bc", "entropy", "accuracy"] if self.categorical else ["loss_bc"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss of a batch that holds :attr:`in_keys`; the input is left as it is."""
+        fit = self._fit(tensordict)
+        result = TensorDict(
+            {"loss_bc": self._reduced(fit.cost, fit.counted), **self._statistics(fit, fit.counted)}
+        )
+        self._clear_weakrefs(tensordict, result, "actor_network_params")
+        return result
+
+
+class DistillationLoss(ActorLoss):
+    """Likelihood of expert actions and of actions in rollouts that survived a search (paper, III).
+
+    The mean negative log-likelihood over the valid expert entries plus that over the valid rollout entries: each
+    kind has its own mean, so the balance does not depend on how many of each a batch holds.
+
+    Args:
+        actor_network: probabilistic module with a `get_dist`, over discrete or continuous actions.
+        reduction: `"mean"` as above (0 for a kind that is absent), `"sum"`, or `"none"`, which keeps the shape
+            `[...]` of the log-probability, zeros where an entry does not count.
+        label_smoothing: share of the target spread evenly over all possible categories, in [0, 1); categorical actors
+            only.
+        use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
+
+    Writes `loss_distillation` and, detached, `nll_expert` and `nll_rollout` (unweighted, without label smoothing);
+    for categorical actors also `entropy` and `accuracy` on the expert entries, as :class:`BCLoss` does. They are
+    means over the entries that count, 0 without one; without reduction they are per entry like the loss.
+
+    Raises:
+        KeyError: at the call, if the action, a flag or the mask is missing.
+        ValueError: for a bad argument, or an action or flags of another shape.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that can be set by `.set_keys(name=key)`.
+
+        Attributes:
+            action (NestedKey): the action to imitate.
+            valid (NestedKey): bool mask, True where an agent counts.
+            rollout (NestedKey): bool, True where the action comes from a rollout, False where from an expert.
+        """
+
+        action: NestedKey = ("agents", "action")
+        valid: NestedKey = ("agents", "valid")
+        rollout: NestedKey = ("agents", "rollout")
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential | ProbabilisticTensorDictModule,
+        *,
+        reduction: Reduction | None = None,
+        label_smoothing: float = 0.0,
+        use_mask: bool | None = None,
+    ) -> None:
+        super().__init__(actor_network, reduction, label_smoothing, use_mask)
+        statistics = ["entropy", "accuracy"] if self.categorical else []
+        self.out_keys = ["loss_distillation", "nll_expert", "nll_rollout", *statistics]
+
+    def _read_keys(self) -> list[NestedKey]:
+        return [*super()._read_keys(), self.tensor_keys.rollout]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss of a batch that holds :attr:`in_keys`; the input is left as it is."""
+        fit = self._fit(tensordict)
+        shape = fit.counted.shape
+        rollout = self._flags(tensordict, self.tensor_keys.rollout, "rollout flag", shape)
+        expert, rollout = fit.counted & ~rollout, fit.counted & rollout
+        reduction: Reduction = "none" if self.reduction == "none" else "mean"
+        result = TensorDict(
+            {
+                "loss_distillation": self._reduced(fit.cost, expert) + self._reduced(fit.cost, rollout),
+                "nll_expert": self._reduced(fit.nll, expert, reduction),
+                "nll_rollout": self._reduced(fit.nll, rollout, reduction),
+                **self._statistics(fit, expert),
+            }
+        )
+        self._clear_weakrefs(tensordict, result, "actor_network_params")
+        return result

@@ -12,7 +12,7 @@ import shapely
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from symphony.geometry.stations import stations_along, to_pieces
+from symphony.geometry.polylines import stations_along, to_pieces
 from symphony.roadgraph.graph import LaneGraph
 from symphony.roadgraph.lines import Reals, turn_between
 from symphony.roadgraph.paths import (

@@ -24,7 +24,7 @@ from symphony.envs.routes import SPACING
 from symphony.envs.scene import PointType, SceneBatch
 from symphony.geometry.frames import wrap
 from symphony.geometry.nearest import nearest, on_host
-from symphony.geometry.stations import NEAR
+from symphony.geometry.polylines import NEAR
 from symphony.planners import included
 from symphony.planners.interface import MAX_BRAKING, MAX_STEERING
 
@@ -259,7 +259,7 @@ def _project(
     about: Float[Tensor, " P"] | None = None,
 ) -> tuple[Float[Tensor, "P J"], Float[Tensor, "P J"], Float[Tensor, "P J"]]:
     """Metres along, metres to the left, and heading of the line, at its places nearest to some: of several passes of
-    the pieces that count the earliest (see :mod:`symphony.geometry.stations`), or the nearest to so many metres.
+    the pieces that count the earliest (see :mod:`symphony.geometry.polylines`), or the nearest to so many metres.
     """
     start, length = line.points[:, :-1], line.arc.diff(dim=-1)
     ahead = line.points.diff(dim=1) / length.clamp_min(1e-6)[..., None]

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.data.context import relations
 from symphony.data.segment import AgentType, RunSegment
+from symphony.data.selection import relations
 from symphony.metrics import OrderStatistics, order_statistics, passing_gap
 from symphony.wosac.scorer import SimulatedRollouts
 

@@ -28,8 +28,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.bounds import MAX_POINTS, MAX_STEPS, check_counts
-from symphony.data.segment import AgentType, Bools, LaneType, MarkType, RoadMap, RunSegment
+from symphony.data.segment import (
+    MAX_POINTS,
+    MAX_STEPS,
+    AgentType,
+    Bools,
+    LaneType,
+    MarkType,
+    RoadMap,
+    RunSegment,
+    check_counts,
+)
 from symphony.data.sources import lines
 from symphony.data.sources.base import Doubles, Item, Reader, T, located, motion, read_whole, readable, refuse
 from symphony.data.sources.lines import Lane

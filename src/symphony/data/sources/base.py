@@ -11,10 +11,9 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.bounds import MAX_FILE
 from symphony.data.odd import mended
 from symphony.data.resample import EVEN
-from symphony.data.segment import AgentType, Bools, Floats, RunSegment, validate
+from symphony.data.segment import MAX_FILE, AgentType, Bools, Floats, RunSegment, validate
 from symphony.errors import ConfigError, DataError
 
 T = TypeVar("T")

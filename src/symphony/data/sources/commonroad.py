@@ -28,8 +28,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.bounds import check_counts, check_signals
-from symphony.data.segment import AgentType, Bools, LaneType, MarkType, RunSegment, SignalState
+from symphony.data.segment import (
+    AgentType,
+    Bools,
+    LaneType,
+    MarkType,
+    RunSegment,
+    SignalState,
+    check_counts,
+    check_signals,
+)
 from symphony.data.sources import base, lines
 from symphony.data.sources.base import Doubles, Item, Reader, by_ego, located, motion, readable, refuse
 from symphony.data.sources.lines import Lane

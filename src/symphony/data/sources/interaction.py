@@ -34,9 +34,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.bounds import check_counts
 from symphony.data.resample import MAX_GAP, evened
-from symphony.data.segment import Bools, Floats, RoadMap, RunSegment, SignalState
+from symphony.data.segment import Bools, Floats, RoadMap, RunSegment, SignalState, check_counts
 from symphony.data.sources import base, lanelet2, lines
 from symphony.data.sources import interaction_tracks as tracks
 from symphony.data.sources.base import Doubles, Item, Reader, check_choice, located, read_whole, refuse

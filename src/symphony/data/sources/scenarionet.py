@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 import shapely
 
-from symphony.data.bounds import MAX_STEPS, check_counts
 from symphony.data.resample import evened, wrap
 from symphony.data.segment import (
+    MAX_STEPS,
     AgentType,
     Bools,
     Floats,
@@ -37,6 +37,7 @@ from symphony.data.segment import (
     RoadMap,
     RunSegment,
     SignalState,
+    check_counts,
 )
 from symphony.data.sources import base, lines
 from symphony.data.sources.base import Doubles, Item, Reader, located, motion, refuse

@@ -23,9 +23,18 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from symphony.data.bounds import MAX_AGENTS, check_counts, check_signals
 from symphony.data.resample import evened
-from symphony.data.segment import AgentType, Bools, LaneType, MarkType, RunSegment, SignalState
+from symphony.data.segment import (
+    MAX_AGENTS,
+    AgentType,
+    Bools,
+    LaneType,
+    MarkType,
+    RunSegment,
+    SignalState,
+    check_counts,
+    check_signals,
+)
 from symphony.data.sources import base, lines
 from symphony.data.sources import womd_pb2 as pb
 from symphony.data.sources.base import Doubles, Item, Reader, motion, refuse
