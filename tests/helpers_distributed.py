@@ -20,7 +20,7 @@ from torch import Tensor
 from helpers_runs import pieces, tiny
 from symphony import keys
 from symphony.agents.choice import choose
-from symphony.config import DiscriminatorConfig, MGAILConfig, TrainConfig, ValidationConfig
+from symphony.config import MGAILConfig, TrainConfig, ValidationConfig
 from symphony.errors import ConfigError
 from symphony.learning import SceneDataset
 from symphony.recipes import recipe_of, train
@@ -35,15 +35,9 @@ CPU = torch.device("cpu")
 
 def config(method: Any, store: Path, out: Path) -> TrainConfig:
     """Of a run with all that is random, and as much of MGAIL as there is."""
-    return tiny(
-        method,
-        store,
-        out,
-        steps=4,
-        validation=ValidationConfig(data=store, segments=1, rollouts=1),
-        discriminator=DiscriminatorConfig(hidden=8),
-        mgail=MGAILConfig(regression=2, head_start=1, rollouts=2, expert_weight=0.5),
-    )
+    validation = ValidationConfig(data=store, segments=1, rollouts=1)
+    mgail = MGAILConfig(regression=2, head_start=1, rollouts=2, expert_weight=0.5)
+    return tiny(method, store, out, validation=validation, mgail=mgail)
 
 
 def fresh(method: str, store: Path, world: Processes) -> Trainer:
@@ -143,17 +137,15 @@ def main(rank: int, store: Path, out: Path) -> None:
     found: dict[str, Any] = {}
     with processes(CPU) as world:
         found["world"] = [world.rank, world.count, world.is_main]
-        found["mean"] = {
-            name: value.item()
-            for name, value in world.mean(
-                {
-                    "both": torch.tensor(float(rank)),
-                    "one": torch.tensor(3.0 if rank else float("nan")),
-                    "none": torch.tensor(float("nan")),
-                    "infinite": torch.tensor(float("inf") if rank else 1.0),
-                }
-            ).items()
+        nan, inf = float("nan"), float("inf")
+        own = {
+            "both": float(rank),
+            "one": 3.0 if rank else nan,
+            "none": nan,
+            "infinite": inf if rank else 1.0,
         }
+        mean = world.mean({name: torch.tensor(value) for name, value in own.items()})
+        found["mean"] = {name: value.item() for name, value in mean.items()}
         found["losses"] = {kind: compare(kind, store, world) for kind in LOSSES}
         found["runs"] = {method: of_run(method, store, out, rank) for method in TRAINED}
     (out / f"rank{rank}.json").write_text(json.dumps(found))

@@ -110,9 +110,7 @@ def altered(monkeypatch: pytest.MonkeyPatch) -> Altered:
     return alter
 
 
-def test_skipped_updates_are_recorded_and_told_once(
-    store: Path, tmp_path: Path, altered: Altered, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_skipped_updates_are_recorded_and_told_once(store, tmp_path, altered, capsys):
     altered(lambda step: {"gradient_norm_policy": NAN} if step in (1, 2, 4) else {})
     out, sparse = tmp_path / "run", tmp_path / "sparse"
     train(tiny("bc", store, out, steps=6))
@@ -144,9 +142,7 @@ def test_a_network_that_is_stepped_twice_loses_no_skip(spoiled: int, store: Path
     assert Skips().count(trainer._update(0)) == ["policy"]
 
 
-def test_a_skipped_update_leaves_weights_and_optimizer_as_they_were(
-    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_skipped_update_leaves_weights_and_optimizer_as_they_were(store, tmp_path, monkeypatch):
     trainer = build(tiny("bc", store, tmp_path / "run"))
     trainer._update(0)
 
@@ -165,9 +161,7 @@ def test_a_skipped_update_leaves_weights_and_optimizer_as_they_were(
     assert not torch.equal(before[0], state()[0])
 
 
-def test_training_gives_up_with_one_line(
-    store: Path, tmp_path: Path, altered: Altered, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_training_gives_up_with_one_line(store, tmp_path, altered, capsys):
     altered(lambda step: {"gradient_norm_policy": NAN, "loss_policy": INF} if step >= 4 else {})
     small = "--agent.hidden 8 --agent.num-points 12 --states 8 --checkpoint-every 2"
     command = f"train bc --data {store} --out {tmp_path}/run --wandb disabled {small}"
@@ -179,9 +173,7 @@ def test_training_gives_up_with_one_line(
     assert choose(tmp_path / "run").name.endswith(str(4 + PATIENCE - 2))
 
 
-def test_a_discriminator_that_has_won_raises_an_alarm(
-    store: Path, tmp_path: Path, altered: Altered, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_discriminator_that_has_won_raises_an_alarm(store, tmp_path, altered, capsys):
     altered(lambda step: {"discriminator_auc": 0.999 if step < WINDOW + 2 else 0.9})
     out, how = tmp_path / "run", {"steps": WINDOW + 4, "checkpoint_every": WINDOW + 2}
     train(tiny("bc_ts", store, out, **how))

@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from helpers_collectors import ACTION, STREAM, Policy, Walk, X, assert_same, distance, give_streams, starts
@@ -191,10 +191,3 @@ def test_as_a_collector() -> None:
         assert torch.equal(batch.get(("collector", "beam_slot")), torch.arange(4)[:, None].expand(3, 4, 10))
     assert collector.simulated_frames > 2 * frames
     collector.shutdown()
-
-
-def test_a_start_may_be_a_view() -> None:
-    start = Walk().reset(TensorDict({}, [2])).unsqueeze(-1).expand(2, 3)
-    found = look(start, replace(RULE, renew=lambda state, attempt: other_numbers(state.copy(), attempt)))
-    x = found.trajectories.get(X)
-    assert torch.equal(x[:, 0], x[:, 2])  # one stream, one course

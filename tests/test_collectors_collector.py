@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import pickle
-import time
 
 import pytest
 import torch
@@ -17,12 +16,8 @@ from torchrl.envs import EnvBase, PendulumEnv, StepCounter
 from helpers_collectors import ACTION, STREAM, Policy, Walk, X, assert_same, distance, give_streams
 from symphony.collectors import (
     BeamSearchCollector,
-    KeepAll,
-    KeepBest,
     KeyScore,
     Systematic,
-    beam_search,
-    branch,
     with_rows,
 )
 
@@ -89,15 +84,6 @@ def test_best_leaf_and_its_search():
     assert collector.simulated_frames == ROWS * 4 * STEPS == collector.stats()["simulated_frames"]
 
 
-def test_search_lowers_the_score():
-    means = []
-    for rule in (KeepAll(), KeepBest()):
-        collector = make(rule=rule, branches=8, leaves=8, frames_per_batch=8 * FRAMES)
-        collector.set_seed(0)
-        means.append(torch.stack([batch.get(EXTRAS[0]).mean() for batch in collector]).mean())
-    assert means[1] < 0.9 * means[0]
-
-
 def test_same_seed_same_data():
     def data(seed):
         collector = make(rule=Systematic(0.5))
@@ -129,31 +115,6 @@ def test_reloading():
     assert min(int(i.min()) for i in ids) >= 2 * ROWS
     assert second.stats()["frames"] == second.total_frames
     make().load_state_dict(plain_collector().state_dict())
-
-
-def test_weights_are_shared_and_updated():
-    policy = Policy()
-    collector = make(policy=policy)
-    assert collector.policy is policy
-    before = next(iter(collector))
-    policy.gain.data.fill_(-0.9)
-    collector.update_policy_weights_()
-    after = collector.next()
-    assert after.get(X)[:, -1].abs().mean() < before.get(X)[:, -1].abs().mean()
-    collector.update_policy_weights_(TensorDict.from_module(Policy()))
-    assert_close(policy.gain.detach(), torch.tensor(-0.2))
-
-
-def test_hooks_and_postproc():
-    calls = []
-    collector = make(
-        pre_collect_hook=lambda: calls.append("pre"),
-        post_collect_hook=lambda batch: calls.append(tuple(batch.shape)),
-        postproc=lambda batch: batch.set("twice", 2 * batch.get(("next", *X))),
-    )
-    for batch in collector:
-        assert_close(batch.get("twice"), 2 * batch.get(("next", *X)))
-    assert calls == ["pre", (ROWS, STEPS)] * 3
 
 
 @pytest.mark.parametrize("leaves", [None, 2])
@@ -189,27 +150,6 @@ def test_trajectories_are_complete_and_stop_at_their_end():
     one = {"trajs_per_batch": 1, "traj_format": "cat"}
     assert not list(make(**one))
     assert len(list(make(set_truncated=True, **one))) == 3 * ROWS
-
-
-def test_trajectory_ids_never_repeat():
-    ids = torch.cat([batch.get(("collector", "traj_ids")) for batch in make()])
-    assert (ids == ids[:, :1]).all()
-    assert len(ids[:, 0].unique()) == 3 * ROWS
-    assert ("collector", "traj_ids") not in next(iter(make(track_traj_ids=False))).keys(True, True)
-
-
-def test_start_and_shutdown():
-    """One item of the replay buffer per row."""
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1000), batch_size=5)
-    collector = make(replay_buffer=buffer, total_frames=-1)
-    collector.start()
-    waited = time.monotonic() + 60
-    while buffer.write_count < 2 * ROWS and time.monotonic() < waited:
-        time.sleep(0.01)
-    collector.async_shutdown()
-    assert len(buffer) >= 2 * ROWS
-    assert buffer.sample().shape == (5, STEPS)
-    assert collector.closed
 
 
 @pytest.mark.filterwarnings("ignore:Nested TransformedEnvs:UserWarning")
@@ -264,33 +204,6 @@ def test_what_can_not_be_right_is_an_error():
     Failing.batch_locked = True
     with pytest.raises(ValueError, match="Failing can't be branched: it is batch-locked"):
         make(Failing)
-
-
-def test_a_rule_and_an_aggregate_of_ones_own():
-    """Any callables; the collector's batch is the search's."""
-
-    def median(scores):
-        return scores.flatten(-2).median(-1).values
-
-    def drop_worst(totals, noise=None):
-        slots = torch.arange(totals.shape[-1]).expand(totals.shape).clone()
-        return slots.scatter(-1, totals.argmax(-1, keepdim=True), totals.argmin(-1, keepdim=True))
-
-    how = {"rule": drop_worst, "aggregate": median}
-    collector, env = make(leaves=4, frames_per_batch=4 * FRAMES, keep_tree=True, **how), make_env()
-    for seeded in (collector, env):
-        seeded.set_seed(3)
-    batch = collector.next()
-    scores = batch.get("tree").get(EXTRAS[0])
-    start = give_streams(branch(env.reset(), 4).copy())
-    how |= {"steps": STEPS, "prune_every": 4, "slot_keys": [STREAM]}
-    found = beam_search(env.base_env, Policy(), distance, start, **how)
-    assert_close(found.simulated_scores, scores)
-    assert_close(found.totals, scores.unflatten(2, (2, 4)).flatten(-2).median(-1).values.transpose(1, 2))
-    for totals, parents in zip(found.totals.flatten(0, 1), found.parents.flatten(0, 1), strict=True):
-        kept = [slot if slot != int(totals.argmax()) else int(totals.argmin()) for slot in range(4)]
-        assert parents.tolist() == kept
-    assert_close(batch.get(("next", *X)), found.trajectories.get(("next", *X)))
 
 
 def test_a_policy_on_a_device_of_its_own_gets_its_inputs_there():

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -14,7 +11,7 @@ from torchrl.collectors import MultiSyncCollector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import PendulumEnv
 
-from helpers_collectors import ACTION, STREAM, Policy, Walk, X, assert_same, distance, give_streams, noise
+from helpers_collectors import STREAM, Policy, Walk, X, assert_same, distance, give_streams
 from symphony.collectors import BeamSearchCollector, KeyScore, Systematic, with_rows
 
 ROWS, STEPS, WORKERS = 3, 8, 2
@@ -143,31 +140,3 @@ def test_workers_that_nobody_seeded_draw_apart():
     firsts = [collector.next() for collector in collectors]
     for key in ("th", "action"):
         assert not torch.isclose(firsts[0].get(key), firsts[1].get(key)).any()
-
-
-@pytest.mark.slow
-def test_through_ray():
-    """One worker, since each takes seconds to start; that several draw apart is shown above."""
-    ray = pytest.importorskip("ray")
-    from torchrl.collectors.distributed import RayCollector
-
-    path = ":".join([str(Path(__file__).parent), *sys.path])
-    ray.init(num_cpus=1, include_dashboard=False, runtime_env={"env_vars": {"PYTHONPATH": path}})
-    how = {"frames_per_batch": FRAMES, "total_frames": 2 * FRAMES, "sync": True}
-    try:
-        policy, bound = Policy(), BeamSearchCollector.bind(score=distance, **SEARCH)
-        remote = {"num_cpus": 1, "num_gpus": 0}
-        collector = RayCollector([fresh_env], policy, collector_class=bound, remote_configs=remote, **how)
-        policy.gain.data.fill_(-0.9)
-        collector.update_policy_weights_(TensorDict.from_module(policy))
-        batches = [batch.clone() for batch in collector]
-        collector.shutdown()
-    finally:
-        ray.shutdown()
-    assert len(batches) == 2
-    for batch in batches:
-        assert batch.numel() == FRAMES
-        assert set(batch.keys(True, True)) >= EXTRAS
-        assert_close(batch.get(ACTION), -0.9 * batch.get(X) + noise(batch, 2))
-    starts = torch.cat([batch.get(X)[..., 0, :, 0].reshape(-1, 2) for batch in batches])
-    assert len(starts.unique(dim=0)) == 2 * ROWS

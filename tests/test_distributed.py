@@ -14,8 +14,8 @@ from helpers_distributed import LOSSES, TRAINED
 from helpers_processes import output_of
 from helpers_runs import same_weights, weights
 from helpers_segments import crossing, straight_road
+from helpers_store import fill
 from symphony.agents.checkpoint import checkpoints, latest, load_checkpoint
-from symphony.data.store_writer import StoreWriter
 from symphony.training.logging import read_metrics
 from symphony.training.processes import Processes, processes
 
@@ -26,19 +26,14 @@ Found = tuple[Path, list[dict[str, Any]]]
 def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     """The folder of what the two have written, and what each reports."""
     base = tmp_path_factory.mktemp("distributed")
-    with StoreWriter(base / "store") as writer:
-        for seed in range(2):
-            writer.append(straight_road(4, seed=seed, steps=9))
-            writer.append(crossing(4, seed=seed, steps=8))
+    made = [(straight_road(4, seed=seed, steps=9), crossing(4, seed=seed, steps=8)) for seed in range(2)]
+    fill(base / "store", [segment for both in made for segment in both])
     output_of(helpers_distributed.both, base / "store", base, said=base / "said.txt", limit=500)
     return base, [json.loads((base / f"rank{rank}.json").read_text()) for rank in range(2)]
 
 
-def test_each_knows_its_place(found: Found) -> None:
+def test_each_knows_its_place_and_numbers_are_means_of_those_that_are_known(found: Found) -> None:
     assert [report["world"] for report in found[1]] == [[0, 2, True], [1, 2, False]]
-
-
-def test_numbers_are_means_of_those_that_are_known(found: Found) -> None:
     for report in found[1]:
         mean = report["mean"]
         assert (mean["both"], mean["one"], mean["infinite"]) == (0.5, 3.0, float("inf"))

@@ -43,9 +43,7 @@ def segments() -> list[RunSegment]:
 
 @DYNAMICS
 @pytest.mark.parametrize("together", [12, 10_000])
-def test_fitting_together_is_the_fit_of_the_dynamics(
-    dynamics: Any, together: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fitting_together_is_the_fit_of_the_dynamics(dynamics, together, monkeypatch):
     monkeypatch.setattr(module, "TOGETHER", together)
     for segment, found in zip(segments(), fit_experts(segments(), dynamics), strict=True):
         rows = found.agent.numpy()
@@ -113,9 +111,7 @@ def test_the_fit_of_ngsim_ends_near_the_log(samples: Path) -> None:
     st.integers(1, 60),
     st.none() | st.integers(1, 5),
 )
-def test_the_cache_gives_what_was_asked_for_and_holds_no_more_than_it_may(
-    calls: list[list[int]], limit: int, keep: int | None
-) -> None:
+def test_the_cache_gives_what_was_asked_for_and_holds_no_more_than_it_may(calls, limit, keep):
     asked: list[list[int]] = []
 
     def make(items: Any) -> list[bytes]:
@@ -166,9 +162,7 @@ def same(a: Experts, b: Experts) -> None:
 
 @DYNAMICS
 @pytest.mark.parametrize("routes", [True, False])
-def test_what_was_kept_is_what_was_fitted(
-    store: Path, dynamics: Any, routes: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_kept_is_what_was_fitted(store, dynamics, routes, monkeypatch):
     first = data(store, dynamics, routes=routes).experts.many([0, 1, 2])
     assert len(files(store)) == 3
     monkeypatch.setattr("symphony.learning.demonstrations.fit_experts", None)  # nothing is fitted again

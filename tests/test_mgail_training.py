@@ -17,10 +17,11 @@ from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony import keys
 from symphony.agents import load_agent
+from symphony.cli import main
 from symphony.config import EvaluateConfig, MGAILConfig, TrainConfig
 from symphony.data.store import SegmentStore
 from symphony.envs import Displacement
-from symphony.errors import ConfigError, DataError, SymphonyError
+from symphony.errors import SymphonyError
 from symphony.evaluation import evaluate
 from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
@@ -85,9 +86,7 @@ def moved(before: dict[str, list[Tensor]], after: dict[str, list[Tensor]]) -> se
 
 
 @pytest.mark.parametrize(("method", "cells"), [*((method, 0) for method in METHODS), ("mgail", 5)])
-def test_each_phase_changes_the_networks_it_is_for(
-    store: Path, tmp_path: Path, method: str, cells: int
-) -> None:
+def test_each_phase_changes_the_networks_it_is_for(store, tmp_path, method, cells):
     settings = config(method, store, tmp_path, mgail=replace(SHORT, expert_weight=0.0))
     trainer = build(replace(settings, agent=replace(settings.agent, cells=cells)))
     goals, rates = {"goals"} if method.endswith("_h") else set(), []
@@ -139,18 +138,8 @@ def test_the_gradient_goes_along_what_survived(store: Path, tmp_path: Path, meth
     assert (begin[keys.GOAL] >= 0).any() == method.endswith("_h")
 
 
-def test_settings_of_the_configuration_reach_the_loss(store: Path, tmp_path: Path) -> None:
-    settings = MGAILConfig(cost="logit", truncate=4, react=True)
-    loss = pieces(build(config("mgail", store, tmp_path, mgail=settings)))["mgail_loss"]
-    assert (loss.cost, loss.truncate, loss.detach_keys) == ("logit", 4, [])
-    loss = pieces(build(config("mgail_h", store, tmp_path)))["mgail_loss"]
-    assert set(loss.detach_keys) == {keys.OWN, keys.OBJECTS, keys.POINTS, keys.ROUTE}
-
-
 @pytest.mark.parametrize("method", ["mgail", "mgail_ts_h"])
-def test_regression_beside_it_and_more_updates_of_the_discriminator(
-    store: Path, tmp_path: Path, method: str
-) -> None:
+def test_regression_beside_it_and_more_updates_of_the_discriminator(store, tmp_path, method):
     found: list[dict[str, Tensor]] = []
     both = MGAILConfig(regression=0, head_start=0, rollouts=3, discriminator_updates=2)
     for weight in (0.5, 1.0):
@@ -166,9 +155,7 @@ def test_regression_beside_it_and_more_updates_of_the_discriminator(
     assert half != 0
 
 
-def test_a_run_that_ends_before_its_adversarial_updates_says_so(
-    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_ends_before_its_adversarial_updates_says_so(store, tmp_path, capsys):
     train(config("mgail", store, tmp_path / "short", steps=4))
     assert "warning: the run ends at update 4, before the first of adversarial" in capsys.readouterr().err
     train(config("mgail", store, tmp_path / "long", steps=5))
@@ -176,9 +163,7 @@ def test_a_run_that_ends_before_its_adversarial_updates_says_so(
 
 
 @pytest.mark.parametrize(("method", "dies_at"), [("mgail", 5), ("mgail_ts_h", 3)])
-def test_a_killed_run_ends_like_an_unbroken_one(
-    store: Path, trained: Trained, tmp_path: Path, method: str, dies_at: int
-) -> None:
+def test_a_killed_run_ends_like_an_unbroken_one(store, trained, tmp_path, method, dies_at):
     settings = config(method, store, tmp_path / "run", resume=True)
     stopped(trained(method), settings.out, dies_at - 1)
     train(settings)
@@ -187,9 +172,7 @@ def test_a_killed_run_ends_like_an_unbroken_one(
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_an_agent_is_evaluated_as_it_was_trained_or_otherwise(
-    trained: Trained, store: Path, method: str
-) -> None:
+def test_an_agent_is_evaluated_as_it_was_trained_or_otherwise(trained, store, method):
     agent = load_agent(str(trained(method)))
     assert agent.dynamics == Displacement()
     assert (agent.goals is None) == (not method.endswith("_h"))
@@ -199,6 +182,16 @@ def test_an_agent_is_evaluated_as_it_was_trained_or_otherwise(
     other = evaluate(agent, store, replace(SETTINGS, search=kinds["_ts" in method])).numbers()
     assert usual["search"] != other["search"]
     assert other["ade"] != usual["ade"]
+
+
+def test_a_rule_of_the_user_that_fails_is_an_error_in_a_line(store, tmp_path, capsys):
+    rule = tmp_path / "mine.py"
+    rule.write_text("def rule():\n    return lambda totals, noise: totals['nothing']\n")
+    words = f"--data {store} --out {tmp_path}/run --wandb disabled --search.rule {rule}:rule"
+    assert main(f"train bc_ts {words} --agent.hidden 8 --search.branches 2".split()) == 1
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith("symphony: error: <function rule.<locals>.<lambda> at")
+    assert "Error: " in last
 
 
 def test_adversarial_training_starts_from_a_regression(store: Path, tmp_path: Path) -> None:
@@ -229,17 +222,6 @@ def test_the_duration_cuts_segments(seconds: Path, tmp_path: Path) -> None:
         assert (cut.position == full.position[:, :6]).all()
         assert cut.signal_state.shape[1] == cut.valid.shape[1] == cut.num_steps == 6
         assert short.experts(item).states.shape[1] == 6
-
-
-def test_a_segment_too_short_for_the_duration_is_named(seconds: Path, tmp_path: Path) -> None:
-    settings = config("mgail", seconds, tmp_path / "run", duration=2, segments=3)
-    train(replace(settings, steps=1))
-    with pytest.raises(DataError, match=r"has 2.* s, 3 are asked for") as caught:
-        train(replace(settings, out=tmp_path / "long", duration=3))
-    assert caught.value.file == seconds
-    assert caught.value.segment in ("straight-0", "crossing-0", "crossing-1")
-    with pytest.raises(ConfigError, match="duration"):
-        config("mgail", seconds, tmp_path, duration=-1)
 
 
 def test_an_agent_is_evaluated_for_the_duration_it_was_trained_with(seconds: Path, tmp_path: Path) -> None:

@@ -59,9 +59,7 @@ def test_recipe(run_script: Any, tmp_path: Path, method: str, capsys: pytest.Cap
     assert f"{found['ade']:.2f}" in capsys.readouterr().out
 
 
-def test_a_changed_copy_elsewhere_is_what_runs(
-    run_script: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_changed_copy_elsewhere_is_what_runs(run_script, tmp_path, capsys):
     fill(tmp_path / "data", [crossing(4, steps=8)])
     source, update = (RECIPES / "bc.py").read_text(encoding="utf-8"), 'yield "policy", policy_loss(experts)'
     assert update in source

@@ -130,9 +130,7 @@ def test_flags_of_the_environment_are_those_of_the_metrics(store: Path) -> None:
     assert 0 < off.float().mean() < 1
 
 
-def test_command_line_trains_and_evaluates(
-    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_line_trains_and_evaluates(store, tmp_path, capsys):
     out, file, picture = tmp_path / "run", tmp_path / "numbers.json", tmp_path / "rollouts.png"
     small = "--agent.hidden 8 --agent.num-points 20 --wandb disabled"
     assert main(f"train bc --data {store} --out {out} --steps 3 --seed 4 {small}".split()) == 0

@@ -55,9 +55,7 @@ def part(run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(run, tmp_path / "part"))
 
 
-def test_a_run_that_was_killed_at_many_a_moment_ends_like_one_that_was_not(
-    store: Path, tmp_path: Path
-) -> None:
+def test_a_run_that_was_killed_at_many_a_moment_ends_like_one_that_was_not(store, tmp_path):
     words = output_of(helpers_killed.main, store, tmp_path, "bc_ts", said=tmp_path / "said.txt").split()
     assert words == [name for name, _, _ in helpers_killed.DEATHS]
     part, whole = tmp_path / "killed", tmp_path / "whole"
@@ -70,9 +68,7 @@ def test_a_run_that_was_killed_at_many_a_moment_ends_like_one_that_was_not(
     assert left == []
 
 
-def test_a_full_disk_stops_training_and_leaves_the_last_checkpoint(
-    run: Path, store: Path, part: Path
-) -> None:
+def test_a_full_disk_stops_training_and_leaves_the_last_checkpoint(run, store, part):
     """Whatever file it is that finds no room."""
     shutil.rmtree(choose(part, "4"))
     before, settings = learned(part), tiny("bc", store, part, resume=True)
@@ -92,9 +88,7 @@ def test_a_full_disk_stops_training_and_leaves_the_last_checkpoint(
 
 
 @pytest.mark.parametrize("file", ["config.json", "checkpoints/step-000000000004/checkpoint.json"])
-def test_files_of_another_version_are_refused_and_left_alone(
-    run: Path, store: Path, part: Path, file: str
-) -> None:
+def test_files_of_another_version_are_refused_and_left_alone(run, store, part, file):
     changed = {**json.loads((part / file).read_text()), "format": 99}
     (part / file).write_text(json.dumps(changed))
     before = learned(part)
@@ -105,9 +99,7 @@ def test_files_of_another_version_are_refused_and_left_alone(
     assert records(part) == records(run)
 
 
-def test_a_damaged_last_checkpoint_is_named_and_the_one_before_it_can_be_used(
-    run: Path, store: Path, part: Path
-) -> None:
+def test_a_damaged_last_checkpoint_is_named_and_the_one_before_it_can_be_used(run, store, part):
     last = latest(part / "checkpoints")
     assert last is not None
     file = last / "module.policy.safetensors"
@@ -119,9 +111,7 @@ def test_a_damaged_last_checkpoint_is_named_and_the_one_before_it_can_be_used(
     assert same_weights(weights(train(settings)), weights(run))
 
 
-def test_a_run_that_was_killed_before_its_first_checkpoint_starts_over(
-    run: Path, store: Path, part: Path
-) -> None:
+def test_a_run_that_was_killed_before_its_first_checkpoint_starts_over(run, store, part):
     shutil.rmtree(part / "checkpoints")
     with pytest.raises(ConfigError, match="holds a run already"):
         train(tiny("bc", store, part))
@@ -130,9 +120,7 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_starts_over(
     assert records(part) == records(run)
 
 
-def test_checkpoints_without_the_configuration_they_go_with_are_refused(
-    run: Path, store: Path, part: Path
-) -> None:
+def test_checkpoints_without_the_configuration_they_go_with_are_refused(run, store, part):
     (part / "config.json").unlink()
     for resume in (False, True):
         with pytest.raises(ConfigError, match=r"part holds checkpoints without their config\.json"):
@@ -150,9 +138,7 @@ time.sleep(600)
 """
 
 
-def test_two_processes_on_one_run_are_refused_and_the_lock_dies_with_its_process(
-    run: Path, store: Path, part: Path
-) -> None:
+def test_two_processes_on_one_run_are_refused_and_the_lock_dies_with_its_process(run, store, part):
     shutil.rmtree(choose(part, "4"))
     before, settings = learned(part), tiny("bc", store, part, resume=True)
     command = [sys.executable, "-c", LOCKED, str(part / training.LOCK)]
@@ -168,9 +154,7 @@ def test_two_processes_on_one_run_are_refused_and_the_lock_dies_with_its_process
 
 
 @pytest.mark.parametrize("resume", [False, True])
-def test_who_comes_second_does_not_go_on_from_what_it_saw_at_first(
-    run: Path, store: Path, tmp_path: Path, resume: bool
-) -> None:
+def test_who_comes_second_does_not_go_on_from_what_it_saw_at_first(run, store, tmp_path, resume):
     """Two processes that look at the folder before either of them writes there."""
     part = tmp_path / "part"
     if resume:
@@ -187,9 +171,7 @@ BAD = [b"", b"5", b"[1]", b'{"loss": 1}', b'{"step": "x"}', b"\xff\x00", b"{" * 
 
 
 @pytest.mark.parametrize("bad", BAD)
-def test_records_are_kept_up_to_the_checkpoint_and_a_damaged_one_costs_no_others(
-    bad: bytes, tmp_path: Path
-) -> None:
+def test_records_are_kept_up_to_the_checkpoint_and_a_damaged_one_costs_no_others(bad, tmp_path):
     first = Tracker(tmp_path, {}, "disabled")
     for step in range(1, 6):
         first.log(step, {"loss": float(step), "ratio": float("nan"), "norm": float("inf"), "word": "x"})

@@ -54,9 +54,7 @@ def steps(run: Path) -> list[int]:
     return [int(path.name[-12:]) for path in checkpoints(run / "checkpoints")]
 
 
-def test_every_checkpoint_and_the_last_weights_are_evaluated_as_the_evaluator_does(
-    run: Path, held_out: Path
-) -> None:
+def test_every_checkpoint_and_the_last_weights_are_evaluated_as_the_evaluator_does(run, held_out):
     """With search, as the agent is simulated."""
     records = [r for r in read_metrics(run) if "validation_infractions" in r]
     assert [r["step"] for r in records] == [2, 4, 5]
@@ -98,9 +96,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch) -> Scripted:
     return script
 
 
-def test_the_best_checkpoint_stays_and_is_the_agent(
-    store: Path, held_out: Path, tmp_path: Path, scripted: Scripted
-) -> None:
+def test_the_best_checkpoint_stays_and_is_the_agent(store, held_out, tmp_path, scripted):
     scripted(30.0, 20.0, math.nan, 20.0, 25.0, 21.0)
     out = train(config(store, tmp_path / "run", held_out, steps=12))
     assert steps(out) == [4, 8, 10, 12]
@@ -110,9 +106,7 @@ def test_the_best_checkpoint_stays_and_is_the_agent(
     assert load_agent(f"{out}@last").name == f"{out}@last"
 
 
-def test_a_warm_start_takes_the_best_too(
-    store: Path, held_out: Path, tmp_path: Path, scripted: Scripted
-) -> None:
+def test_a_warm_start_takes_the_best_too(store, held_out, tmp_path, scripted):
     scripted(1.0, 2.0)
     source = train(config(store, tmp_path / "source", held_out, steps=4))
     for name, step in ((str(source), 2), (f"{source}@last", 4)):
@@ -120,9 +114,7 @@ def test_a_warm_start_takes_the_best_too(
         assert same_weights(weights(train(still)), weights(f"{source}@{step}"))
 
 
-def test_a_resumed_run_remembers_the_best(
-    store: Path, held_out: Path, tmp_path: Path, scripted: Scripted
-) -> None:
+def test_a_resumed_run_remembers_the_best(store, held_out, tmp_path, scripted):
     whole = config(store, tmp_path / "run", held_out, steps=12)
     scripted(30.0, 10.0, 20.0, 20.0, 20.0, 20.0)
     train(whole)
@@ -142,9 +134,7 @@ def test_a_resumed_run_remembers_the_best(
     assert choose(whole.out).name.endswith("14")
 
 
-def test_what_is_evaluated_stays_the_same_when_a_run_goes_on(
-    store: Path, held_out: Path, tmp_path: Path
-) -> None:
+def test_what_is_evaluated_stays_the_same_when_a_run_goes_on(store, held_out, tmp_path):
     short = config(store, tmp_path / "run", held_out, steps=2)
     train(short)
     for other in ({"rollouts": 3}, {"segments": 2}):

@@ -1,8 +1,7 @@
 """Backtracking: independent lines, of which a bad one goes back in its own past and draws again.
 
 Copying good branches over bad ones makes rollouts alike; here nothing is copied from another line. After every T_p
-steps the lines whose total is above a threshold go back, the first time a little and with every failed try farther,
-in the end to the start; only the lines that are still under way are simulated.
+steps the lines whose total is above a threshold go back, with every failed try farther, in the end to the start.
 
 Legend: M lines (all rows and branches), R lines under way, P periods of T_p steps, N agents.
 """

@@ -171,8 +171,8 @@ class KeepAll:
 class Resampling:
     """Resampling with weights softmax(-totals / temperature), as in particle filters; subclasses draw the copies.
 
-    A branch of weight w gets S w copies on average over the noise. Slots are filled in order of rank, so slot 0 holds
-    the best that goes on. What the rule sees are the totals since a row was last resampled.
+    A branch of weight w gets S w copies on average over the noise, and slot 0 holds the best that goes on. What the
+    rule sees are the totals since a row was last resampled.
 
     Args:
         temperature: in the units of the totals; 1 where they are negative log-likelihoods.
@@ -403,7 +403,10 @@ def checked(
     groups: Int[Tensor, "*b S"] | None = None,
 ) -> Int[Tensor, "*b S"]:
     """The branch each slot goes on from; ValueError if a rule returns something else than int64 indices of them."""
-    parents = rule(totals, noise, groups) if takes_groups(rule) else rule(totals, noise)
+    try:
+        parents = rule(totals, noise, groups) if takes_groups(rule) else rule(totals, noise)
+    except Exception as error:  # whatever a rule of others raises
+        raise ValueError(f"{rule}: {type(error).__name__}: {error}") from error
     if parents.dtype != torch.int64 or parents.shape != totals.shape:
         what = f"{parents.dtype} {tuple(parents.shape)}"
         raise ValueError(f"a pruning rule must return int64 {tuple(totals.shape)}, {rule} returned {what}")

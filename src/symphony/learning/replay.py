@@ -12,6 +12,7 @@ from symphony import keys
 from symphony.collectors import BeamSearchCollector
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.observation import ObservationConfig
+from symphony.errors import ConfigError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.objectives import auc
 
@@ -52,7 +53,10 @@ class SearchReplay:
         see :func:`search_statistics`.
         """
         if self._leaves is None or step % self.every == 0:
-            self._leaves = self.collector.rollout()
+            try:
+                self._leaves = self.collector.rollout()
+            except ValueError as error:  # of a rule of the user
+                raise ConfigError(str(error)) from error
             self._statistics = search_statistics(self.env, self._leaves)
         return self._statistics
 
