@@ -119,11 +119,7 @@ def city() -> dict[str, Any]:
         "lane_segments": {str(node["id"]): node for node in lanes},
         "drivable_areas": {str(k): {"id": k, "area_boundary": points(area)} for k, area in enumerate(areas)},
         "pedestrian_crossings": {
-            "5": {
-                "id": 5,
-                "edge1": points([(58, -4), (58, 9.5)]),
-                "edge2": points([(62, 9.5), (62, -4)]),
-            }
+            "5": {"id": 5, "edge1": points([(58, -4), (58, 9.5)]), "edge2": points([(62, 9.5), (62, -4)])}
         },
     }
 

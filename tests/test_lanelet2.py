@@ -14,17 +14,20 @@ from hypothesis import strategies as st
 from helpers_interaction import BORDER, DASHED, LANELETS, ORIGIN, PARKING, ROAD, WAYS, osm, with_area
 from helpers_sources import off_road
 from symphony.data.segment import LaneType, MarkType, RoadMap
-from symphony.data.sources.geodesy import FLATTENING, SEMI_MAJOR, mercator, utm
 from symphony.data.sources.lanelet2 import (
+    FLATTENING,
     NO_AREA,
     NO_LANELET,
     NO_NODE,
+    SEMI_MAJOR,
     LaneletMap,
     lane_lanelets,
+    mercator,
     middle,
     read_lanelet2,
     road_map,
     stop_line,
+    utm,
 )
 from symphony.errors import DataError
 

@@ -41,7 +41,6 @@ from symphony.data.segment import (
 from symphony.data.sources import base, lines
 from symphony.data.sources.base import Doubles, Item, Reader, by_ego, located, motion, readable, refuse
 from symphony.data.sources.lines import Lane
-from symphony.data.sources.xml_files import integer, load_xml, number
 from symphony.errors import DataError
 
 VERSIONS = ("2018b", "2020a")
@@ -95,7 +94,7 @@ class CommonRoadReader(Reader):
         self.egos = egos
 
     def _read(self, path: Path) -> Iterator[Item]:
-        root = load_xml(path)
+        root = base.load_xml(path)
         name, version = root.get("benchmarkID", ""), root.get("commonRoadVersion")
         refuse(root.tag != "commonRoad", f"not a CommonRoad file, but <{root.tag[:40]}>", "commonRoad")
         refuse(version not in VERSIONS, f"{version!r}, expected {' or '.join(VERSIONS)}", "commonRoadVersion")
@@ -104,7 +103,7 @@ class CommonRoadReader(Reader):
             yield from self._segments(root, name, path)
 
     def _segments(self, root: ET.Element, name: str, path: Path) -> Iterator[Item]:
-        dt = number(root.get("timeStepSize"), "timeStepSize")
+        dt = base.number(root.get("timeStepSize"), "timeStepSize")
         refuse(dt <= 0, f"must be positive, is {dt:g}", "timeStepSize")
         odd: dict[str, str] = {}
         agents, table, valid, dynamic, first_step = _tracks(root, dt, odd)
@@ -178,7 +177,7 @@ def _text(node: ET.Element, tag: str) -> str:
 
 
 def _point(node: ET.Element, field: str) -> tuple[float, float]:
-    return number(node.findtext("x"), field), number(node.findtext("y"), field)
+    return base.number(node.findtext("x"), field), base.number(node.findtext("y"), field)
 
 
 def _points(node: ET.Element | None, field: str) -> Doubles:
@@ -190,7 +189,7 @@ def _points(node: ET.Element | None, field: str) -> Doubles:
 def _references(node: ET.Element, tag: str, field: str) -> list[int]:
     children, field = node.findall(tag), f"{field}: {tag}"
     refuse(len(children) > MAX_REFERENCES, f"{len(children)} references, at most {MAX_REFERENCES}", field)
-    return [integer(child.get("ref"), field) for child in children]
+    return [base.integer(child.get("ref"), field) for child in children]
 
 
 def _obstacle(node: ET.Element, moves: bool) -> tuple[int, int, Doubles, Box]:
@@ -209,7 +208,7 @@ def _obstacle(node: ET.Element, moves: bool) -> tuple[int, int, Doubles, Box]:
     else:  # at rest whatever its file says
         log[:, [0, 4, 5]] = 0
     kind = _TYPES.get(_text(node, "type"), AgentType.OTHER)
-    return integer(node.get("id"), "obstacle id"), kind, log, _shape(node, f"{name}: shape")
+    return base.integer(node.get("id"), "obstacle id"), kind, log, _shape(node, f"{name}: shape")
 
 
 def _state(node: ET.Element, name: str, moves: bool) -> tuple[float, ...]:
@@ -218,7 +217,7 @@ def _state(node: ET.Element, name: str, moves: bool) -> tuple[float, ...]:
     def exact(tag: str, default: float | None) -> float:
         if default is not None and node.find(tag) is None:
             return default
-        return number(node.findtext(f"{tag}/exact"), f"{name}: {tag}")
+        return base.number(node.findtext(f"{tag}/exact"), f"{name}: {tag}")
 
     place, needed = node.find("position/point"), None if moves else 0.0
     if place is None:
@@ -257,9 +256,9 @@ def _shape(node: ET.Element, field: str) -> Box:
     center = part.find("center")
     middle = np.zeros(2) if center is None else np.array(_point(center, field))
     if part.tag == "circle":
-        return [2 * number(part.findtext("radius"), field)] * 2, middle, 0.0
-    sides = [number(part.findtext(side), field) for side in ("length", "width")]
-    return sides, middle, number(part.findtext("orientation", "0"), field)
+        return [2 * base.number(part.findtext("radius"), field)] * 2, middle, 0.0
+    sides = [base.number(part.findtext(side), field) for side in ("length", "width")]
+    return sides, middle, base.number(part.findtext("orientation", "0"), field)
 
 
 @dataclass(frozen=True)
@@ -314,13 +313,15 @@ def _speed_limits(sign: ET.Element) -> dict[int, float]:
     for element in sign.findall("trafficSignElement"):
         value = element.findtext("additionalValue")
         if _text(element, "trafficSignID") in _SPEED_SIGNS and value is not None:
-            limits[integer(sign.get("id"), "trafficSign id")] = number(value, "trafficSign additionalValue")
+            limits[base.integer(sign.get("id"), "trafficSign id")] = base.number(
+                value, "trafficSign additionalValue"
+            )
     return limits
 
 
 def _lanelet(node: ET.Element, limits: dict[int, float]) -> _Lanelet | None:
     """Return a lanelet; None where one of its bounds has fewer than two points."""
-    lanelet_id = integer(node.get("id"), "lanelet id")
+    lanelet_id = base.integer(node.get("id"), "lanelet id")
     field = f"lanelet {lanelet_id}"
     bounds = [node.find(f"{side}Bound") for side in ("left", "right")]
     left, right = (_points(bound, f"{field}: bound") for bound in bounds)
@@ -329,7 +330,7 @@ def _lanelet(node: ET.Element, limits: dict[int, float]) -> _Lanelet | None:
     if len(left) != len(right):
         count = max(len(left), len(right))
         left, right = lines.evenly(left, count), lines.evenly(right, count)
-    speeds = [number(child.text, f"{field}: speedLimit") for child in node.findall("speedLimit")]
+    speeds = [base.number(child.text, f"{field}: speedLimit") for child in node.findall("speedLimit")]
     speeds += [limits[ref] for ref in _references(node, "trafficSignRef", field) if ref in limits]
     limit = min((speed for speed in speeds if speed > 0), default=np.nan)
     kinds = {(kind.text or "").strip() for tag in ("laneletType", "type") for kind in node.findall(tag)}
@@ -385,7 +386,7 @@ def _light(
 
     Its cycle repeats, its first element beginning at the time offset.
     """
-    name = integer(node.get("id"), "trafficLight id")
+    name = base.integer(node.get("id"), "trafficLight id")
     if name not in wanted:
         return None
     field = f"trafficLight {name}"
@@ -397,10 +398,10 @@ def _light(
     colors = [_text(element, "color") for element in elements]
     unknown = [color for color in colors if color not in _COLORS]
     refuse(unknown, f"unknown colors {unknown[:3]}", f"{field}: color")
-    durations = [integer(element.findtext("duration"), f"{field}: duration") for element in elements]
+    durations = [base.integer(element.findtext("duration"), f"{field}: duration") for element in elements]
     fine = min(durations, default=0) >= 1 and sum(durations) <= MAX_CYCLE
     refuse(not fine, "needs elements that last at least one step", f"{field}: cycle")
-    offset = integer(cycle.findtext("timeOffset", "0"), f"{field}: timeOffset") % sum(durations)
+    offset = base.integer(cycle.findtext("timeOffset", "0"), f"{field}: timeOffset") % sum(durations)
     phase = (steps - offset) % sum(durations)
     which = np.searchsorted(np.cumsum(durations), phase, side="right")
     return name, direction, np.array([_COLORS[color] for color in colors], np.uint8)[which]

@@ -39,9 +39,7 @@ from symphony.data.segment import Bools, Floats, RoadMap, RunSegment, SignalStat
 from symphony.data.sources import base, lanelet2, lines
 from symphony.data.sources import interaction_tracks as tracks
 from symphony.data.sources.base import Doubles, Item, Reader, check_choice, located, read_whole, refuse
-from symphony.data.sources.geodesy import mercator, utm
 from symphony.data.sources.interaction_tracks import NOMINAL, Rows
-from symphony.data.sources.xml_files import integer, load_xml, number
 from symphony.errors import ConfigError, DataError
 
 FAR = 200.0
@@ -226,11 +224,11 @@ class _Scene:
 
 
 def _scene(files: Files, rows: Rows, dt: float, start: float) -> _Scene:
-    projection: lanelet2.Projection = partial(utm, origin=np.zeros(2))
+    projection: lanelet2.Projection = partial(lanelet2.utm, origin=np.zeros(2))
     has_phases = files.phases is not None
     if files.meta is not None:
         origin, has_phases = _read_meta(files.meta, files.part)
-        projection = partial(mercator, origin=origin)
+        projection = partial(lanelet2.mercator, origin=origin)
     source = lanelet2.read_lanelet2(files.map, projection)
     with located(file=files.map):
         lanes = lanelet2.lane_lanelets(source)
@@ -309,7 +307,7 @@ def _read_meta(path: Path, part: str) -> tuple[Doubles, bool]:
         head, *rows = _lines(path, 1 << 20)
         found = [row for row in (dict(zip(head, row, strict=False)) for row in rows) if row.get("id") == part]
         refuse(len(found) != 1, f"{len(found)} rows for recording {part}, expected one", "id")
-        origin = np.array([number(found[0].get(name), name) for name in ("originLat", "originLon")])
+        origin = np.array([base.number(found[0].get(name), name) for name in ("originLat", "originLon")])
         # Both spellings occur.
         spat = found[0].get("spatAvailable") or found[0].get("spatAvailible") or "no"
         refuse(spat not in {"yes", "no"}, f"{spat[:20]!r} is neither yes nor no", "spatAvailable")
@@ -355,7 +353,7 @@ def _read_phases(path: Path) -> dict[int, tuple[NDArray[np.int64], NDArray[np.ui
         for k, row in enumerate(rows, start=2):
             if len(row) != len(_PHASE_COLUMNS) or row[2] not in _PHASES:
                 raise DataError(f"{','.join(row)[:60]!r} is no phase", field=f"line {k}")
-            group, time = (integer(entry, f"line {k}") for entry in row[:2])
+            group, time = (base.integer(entry, f"line {k}") for entry in row[:2])
             state = _PHASES[row[2]]
             if entries.setdefault(group, {}).setdefault(time, state) != state:
                 raise DataError(f"signal group {group} has two states", field=f"line {k}")
@@ -376,13 +374,13 @@ def _read_connections(path: Path, projection: lanelet2.Projection) -> list[_Conn
     with located(file=path):
         starts: dict[int, Doubles] = {}
         wanted: list[tuple[int, int, int]] = []
-        for place in load_xml(path, "KML").iter(f"{_KML}Placemark"):
+        for place in base.load_xml(path, "KML").iter(f"{_KML}Placemark"):
             line = place.find(f"{_KML}LineString/{_KML}coordinates")
             data = {node.get("name"): node.findtext(f"{_KML}value") for node in place.iter(f"{_KML}Data")}
             if line is None or "Source" not in data:
                 continue
             sources, sinks, groups = (
-                [integer(part, name) for part in (data.get(name) or "").split(",") if part.strip()]
+                [base.integer(part, name) for part in (data.get(name) or "").split(",") if part.strip()]
                 for name in ("Source", "Sink", "SignalGroup")
             )
             refuse(len(sources) != 1, f"{str(data['Source'])[:40]!r} is not one lane", "Source")
@@ -390,7 +388,7 @@ def _read_connections(path: Path, projection: lanelet2.Projection) -> list[_Conn
             # A line of longitude,latitude,height, of which the first point counts.
             first = ((line.text or "").split() or [""])[0].split(",")
             refuse(len(first) < 2, "has no points", f"lane {sources[0]}: coordinates")
-            longitude, latitude = (number(part, f"lane {sources[0]}: coordinates") for part in first[:2])
+            longitude, latitude = (base.number(part, f"lane {sources[0]}: coordinates") for part in first[:2])
             starts[sources[0]] = projection(np.array([[latitude, longitude]]))[0]
             wanted += [(sources[0], sink, group) for sink, group in zip(sinks, groups, strict=True)]
         refuse(not wanted, "has no lanes with a signal group", "Placemark")

@@ -42,23 +42,14 @@ _HINT = " (motion='positions' takes both from the positions)"
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of one or two files, ordered by case, time and track.
+    """N rows of one or two files, ordered by case, time and track."""
 
-    Attributes:
-        case: [N] number of the case the row belongs to; 0 throughout where the file is one recording.
-        time: [N] milliseconds, and after :func:`stepped` the number of the step.
-        track: [N] id; that of a track named ``P7`` is -8, that of track 7 is 7.
-        kind: [N] :class:`AgentType`, UNSET for ``pedestrian/bicycle``.
-        state: [N, 7] x, y, vx, vy, heading, length, width; NaN where not given.
-        marks: [N, 2] whether the track is one to predict, and an interacting one.
-    """
-
-    case: NDArray[np.int64]
-    time: NDArray[Any]
-    track: NDArray[np.int64]
-    kind: NDArray[np.int64]
-    state: Doubles
-    marks: Bools
+    case: NDArray[np.int64]  # number of the case; 0 throughout where the file is one recording
+    time: NDArray[Any]  # milliseconds, and once they are stepped the number of the step
+    track: NDArray[np.int64]  # id; that of a track named P7 is -8, that of track 7 is 7
+    kind: NDArray[np.int64]  # agent types, UNSET for pedestrian/bicycle
+    state: Doubles  # [N, 7] x, y, vx, vy, heading, length, width; NaN where not given
+    marks: Bools  # [N, 2] whether the track is one to predict, and an interacting one
 
     def __len__(self) -> int:
         return len(self.time)

@@ -1,4 +1,4 @@
-"""Lanelet2 maps: OpenStreetMap XML whose relations are lanelets and regulatory elements.
+"""Lanelet2 maps: OpenStreetMap XML whose relations are lanelets and regulatory elements; and their projections.
 
 - Ways may be drawn in either direction: here both bounds of a lanelet run in its direction of travel, the left one
   on its left. One that is open in both directions counts in the one it is drawn in.
@@ -25,10 +25,10 @@ import numpy as np
 import shapely
 
 from symphony.data.segment import LaneType, MarkType, RoadMap
-from symphony.data.sources import lines
+from symphony.data.sources import base, lines
 from symphony.data.sources.base import Doubles, located, pairs, readable, refuse
 from symphony.data.sources.lines import Lane, Links
-from symphony.data.sources.xml_files import integer, load_xml, number
+from symphony.errors import DataError
 
 MAX_NODES = 2_000_000  # more than any map of a city district
 NO_NODE = "a node left out that the map lacks"
@@ -42,15 +42,16 @@ MPH, KMH = 0.44704, 1 / 3.6
 _DRIVABLE = ["road", "highway", "play_street", "bus_lane", "emergency_lane", "exit", "parking", "freespace"]
 """Subtypes of areas on which vehicles may be."""
 _NO_LANES = frozenset({"walkway", "shared_walkway", "crosswalk", "stairs", "rail"})
-_TYPES = {
-    "bicycle_lane": LaneType.BIKE_LANE,
-    "bikelane": LaneType.BIKE_LANE,
-    "highway": LaneType.FREEWAY,
-}
+_BIKES = ("bicycle_lane", "bikelane")
+_TYPES = dict.fromkeys(_BIKES, LaneType.BIKE_LANE) | {"highway": LaneType.FREEWAY}
 _EDGES = frozenset({"road_border", "curbstone", "fence", "wall", "guard_rail", "jersey_barrier"})
 _PAINT = frozenset({"line_thin", "line_thick", "stop_line"})
 _STOP_SIGNS = re.compile(r"(de206|r1-1(?!\d)|\bstop\b)", re.IGNORECASE)
 _SPEED = re.compile(r"(\d+(?:\.\d+)?)\s*(mph|km/h|kmh|m/s|mps)?\s*$", re.IGNORECASE)
+
+MAX_LATITUDE = 84.0  # degrees up to which UTM is defined
+SEMI_MAJOR, FLATTENING = 6_378_137.0, 1 / 298.257223563  # of the WGS 84 ellipsoid, metres
+_UTM_SCALE = 0.9996
 
 
 @dataclass(frozen=True)
@@ -68,23 +69,14 @@ class Way:
 
 @dataclass(frozen=True)
 class Lanelet:
-    """A stretch of lane between two bounds that run in its direction of travel.
-
-    Attributes:
-        lanelet_id: of the relation.
-        left: left bound.
-        right: right bound.
-        turned: whether left and right run against their way's own direction.
-        tags: of the relation.
-        rules: ids of its regulatory elements.
-    """
+    """A stretch of lane between two bounds that run in its direction of travel."""
 
     lanelet_id: int
     left: Way
     right: Way
-    turned: tuple[bool, bool]
+    turned: tuple[bool, bool]  # whether left and right run against their way's own direction
     tags: Tags
-    rules: Sequence[int]
+    rules: Sequence[int]  # ids of its regulatory elements
 
     @property
     def subtype(self) -> str:
@@ -138,7 +130,7 @@ def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
             lanelets with both bounds; names the file and the element.
     """
     with located(file=path):
-        root = load_xml(path, "OSM")
+        root = base.load_xml(path, "OSM")
         refuse(root.tag != "osm", f"not an OSM file: its root is <{root.tag[:40]}>", "osm")
         odd: dict[str, str] = {}
         ways = _ways(root, projection, odd)
@@ -167,8 +159,8 @@ def _ways(root: ET.Element, projection: Projection, odd: dict[str, str]) -> dict
     places = _places(root, projection)
     ways = {}
     for node in _living(root, "way"):
-        way_id = integer(node.get("id"), "way id")
-        refs = [integer(child.get("ref"), f"way {way_id}: nd") for child in node.findall("nd")]
+        way_id = base.integer(node.get("id"), "way id")
+        refs = [base.integer(child.get("ref"), f"way {way_id}: nd") for child in node.findall("nd")]
         missing = [ref for ref in refs if ref not in places]
         if missing:
             odd.setdefault(NO_NODE, f"way {way_id}: node {missing[0]}")
@@ -184,11 +176,11 @@ def _places(root: ET.Element, projection: Projection) -> dict[int, Doubles]:
     """Return node id -> [2] metres."""
     nodes = list(_living(root, "node"))
     refuse(len(nodes) > MAX_NODES, f"{len(nodes)} nodes, at most {MAX_NODES} can be read", "node")
-    ids = [integer(node.get("id"), "node id") for node in nodes]
+    ids = [base.integer(node.get("id"), "node id") for node in nodes]
 
     def numbers(texts: Sequence[tuple[str | None, str | None]], what: str) -> Doubles:
         both = zip(ids, texts, strict=True)
-        found = [[number(text, f"node {name}: {what}") for text in pair] for name, pair in both]
+        found = [[base.number(text, f"node {name}: {what}") for text in pair] for name, pair in both]
         return np.array(found, np.float64).reshape(-1, 2)
 
     local = [(node.get("x"), node.get("y")) for node in nodes]
@@ -206,7 +198,7 @@ def _members(node: ET.Element, kind: str, field: str) -> dict[str, list[int]]:
     found: dict[str, list[int]] = {}
     for child in node.findall("member"):
         if child.get("type") == kind:
-            found.setdefault(child.get("role", ""), []).append(integer(child.get("ref"), field))
+            found.setdefault(child.get("role", ""), []).append(base.integer(child.get("ref"), field))
     return found
 
 
@@ -217,7 +209,7 @@ def _way(ref: int, ways: dict[int, Way], field: str) -> Way:
 
 
 def _lanelet(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> Lanelet:
-    lanelet_id = integer(node.get("id"), "relation id")
+    lanelet_id = base.integer(node.get("id"), "relation id")
     field = f"lanelet {lanelet_id}"
     members = _members(node, "way", field)
     bounds = []
@@ -253,7 +245,7 @@ def _area(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> shapely.Polygon
     allowed = any(n.startswith("participant:vehicle") and value == "yes" for n, value in named.items())
     if not (allowed if named else tags.get("subtype") in _DRIVABLE):
         return None
-    field = f"area {integer(node.get('id'), 'relation id')}"
+    field = f"area {base.integer(node.get('id'), 'relation id')}"
     members = _members(node, "way", field)
     outer, inner = (_closed(members.get(role, []), ways, f"{field}: {role}") for role in ("outer", "inner"))
     refuse(len(outer) != 1, f"{len(outer)} outlines, expected one", f"{field}: outer")
@@ -268,7 +260,7 @@ def _closed(refs: list[int], ways: dict[int, Way], field: str) -> list[shapely.P
 
 
 def _rule(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> tuple[int, tuple[Tags, list[Way]]]:
-    rule_id = integer(node.get("id"), "relation id")
+    rule_id = base.integer(node.get("id"), "relation id")
     refs = _members(node, "way", f"regulatory element {rule_id}").get("ref_line", [])
     # Lines outside the map's section are missing in it.
     return rule_id, (tags, [ways[ref] for ref in refs if ref in ways and len(ways[ref].line)])
@@ -383,3 +375,60 @@ def stop_line(lane: Lanelet, rules: Rules) -> Doubles | None:
         if tags.get("subtype") == "traffic_light" and ways:
             return ways[0].line.mean(axis=0)
     return None
+
+
+def utm(places: Doubles, origin: Doubles) -> Doubles:
+    """Universal Transverse Mercator on WGS 84, in the zone of the origin, relative to the origin.
+
+    Lanelet2's and INTERACTION's usual projection (there about latitude and longitude 0). Krüger's series to the
+    fourth order in the third flattening (Karney, 2011, arXiv:1002.1417, eq. 35): well below a millimetre inside a
+    zone.
+
+    Takes places [N, 2] and an origin [2] of latitude and longitude in degrees, and gives [N, 2] metres, x towards the
+    grid's east, y towards its north. Latitudes beyond 84 degrees are a :class:`DataError`.
+    """
+    both = _degrees(places, origin)
+    zone = np.clip(np.floor((origin[1] + 180) / 6), 0, 59)
+    n = FLATTENING / (2 - FLATTENING)
+    radius = SEMI_MAJOR / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
+    series = (
+        n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16 + 41 * n**4 / 180,
+        13 * n**2 / 48 - 3 * n**3 / 5 + 557 * n**4 / 1440,
+        61 * n**3 / 240 - 103 * n**4 / 140,
+        49561 * n**4 / 161280,
+    )
+    latitude, longitude = np.radians(both - (0, 6 * zone - 177)).T
+    eccentricity = np.sqrt(FLATTENING * (2 - FLATTENING))
+    sine = np.sin(latitude)
+    # Tangent of the conformal latitude.
+    tangent = np.sinh(np.arctanh(sine) - eccentricity * np.arctanh(eccentricity * sine))
+    xi = np.arctan2(tangent, np.cos(longitude))
+    eta = np.arcsinh(np.sin(longitude) / np.hypot(tangent, np.cos(longitude)))
+    x, y = eta.copy(), xi.copy()
+    for k, factor in enumerate(series, start=1):
+        x += factor * np.cos(2 * k * xi) * np.sinh(2 * k * eta)
+        y += factor * np.sin(2 * k * xi) * np.cosh(2 * k * eta)
+    metres = _UTM_SCALE * radius * np.stack([x, y], axis=-1)
+    return metres[:-1] - metres[-1]
+
+
+def mercator(places: Doubles, origin: Doubles) -> Doubles:
+    """Spherical Mercator, scaled to be true to length at the origin, relative to the origin.
+
+    The projection of the Test Area Autonomous Driving Baden-Württemberg recordings, and of Lanelet2's
+    ``SphericalMercatorProjector``. Arguments, result and errors are those of :func:`utm`.
+    """
+    latitude, longitude = np.radians(_degrees(places, origin)).T
+    scale = SEMI_MAJOR * np.cos(np.radians(origin[0]))
+    metres = scale * np.stack([longitude, np.arctanh(np.sin(latitude))], axis=-1)
+    return metres[:-1] - metres[-1]
+
+
+def _degrees(places: Doubles, origin: Doubles) -> Doubles:
+    """Return [N + 1, 2] degrees, the origin last."""
+    both = np.concatenate([places.reshape(-1, 2), origin[None]])
+    if not (np.abs(both) <= (MAX_LATITUDE, 180)).all():  # comparisons with NaN are false
+        raise DataError(
+            f"a place outside latitudes ±{MAX_LATITUDE:g} and longitudes ±180 degrees", field="lat, lon"
+        )
+    return both

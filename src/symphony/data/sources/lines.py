@@ -16,11 +16,9 @@ from symphony.data.sources.base import Doubles, pairs, refuse, to_float32
 from symphony.errors import DataError
 
 Links = NDArray[np.int32]  # [E, 2] lane indices (from, to)
-MAX_EDGES = 500_000
-MAX_NEAR, MAX_CROSSINGS, MAX_KNOTS = 2_000_000, 50_000, 500
+MAX_EDGES, MAX_NEAR, MAX_CROSSINGS, MAX_KNOTS = 500_000, 2_000_000, 50_000, 500
 """Edges of outlines, pairs of them whose boxes overlap, pairs that cross, and pairs of one outline that do: the time
-and memory of a union grow with them, with the last by a power. Maps of 7 000 edges had 1 500 crossings, and outlines
-one with themselves."""
+and memory of a union grow with them, with the last by a power. Maps of 7 000 edges had 1 500 crossings."""
 PROBES = 200
 MAX_BOUND, SPACING = 10_000.0, 2.0
 """Metres of a lane's bound, at most, and between the points of a centre line."""
@@ -31,28 +29,16 @@ SLIT = 0.1  # metres by which neighbouring areas may miss each other on either s
 
 @dataclass(frozen=True)
 class Lane:
-    """A lane in the coordinates and by the ids of its source.
-
-    Attributes:
-        name: its id.
-        line: [P, 2 or 3] centre line in the direction of travel.
-        kind: :class:`~symphony.data.segment.LaneType`.
-        width: metres; NaN where unknown.
-        speed_limit: m/s; NaN where unknown.
-        successors: ids of lanes that traffic flows into.
-        predecessors: ids of lanes that traffic comes from.
-        left: ids of the neighbours on the left that a lane change may reach.
-        right: ids of the neighbours on the right.
-    """
+    """A lane in the coordinates and by the ids of its source; NaN is what is unknown."""
 
     name: Any
-    line: Doubles
-    kind: int
-    width: float = np.nan
-    speed_limit: float = np.nan
-    successors: Iterable[Any] = ()
-    predecessors: Iterable[Any] = ()
-    left: Iterable[Any] = ()
+    line: Doubles  # [P, 2 or 3] centre line in the direction of travel
+    kind: int  # its LaneType
+    width: float = np.nan  # metres
+    speed_limit: float = np.nan  # m/s
+    successors: Iterable[Any] = ()  # names of lanes that traffic flows into
+    predecessors: Iterable[Any] = ()  # names of lanes that traffic comes from
+    left: Iterable[Any] = ()  # names of the neighbours on the left that a lane change may reach
     right: Iterable[Any] = ()
 
 

@@ -104,10 +104,7 @@ def _never(*_: Any) -> Any:
     raise DataError("makes an array by itself")
 
 
-_NAMES: dict[tuple[str, str], Any] = {
-    ("numpy", "ndarray"): _Named(_never),
-    ("numpy", "dtype"): _Named(_Type),
-}
+_NAMES: dict[tuple[str, str], Any] = {("numpy", "ndarray"): _Named(_never), ("numpy", "dtype"): _Named(_Type)}
 for _core in ("core", "_core"):
     _NAMES[f"numpy.{_core}.multiarray", "_reconstruct"] = _Named(lambda *_: Array())
     _NAMES[f"numpy.{_core}.multiarray", "scalar"] = _Named(_scalar)

@@ -55,20 +55,13 @@ BESIDE = (2.0, 5.5)  # metres between the centre lines of neighbours
 _STATE = {"valid": 1, "position": 3, "heading": 1, "velocity": 2, "length": 1, "width": 1, "height": 1}
 """Entries of a track's state, and how many numbers each has at a step."""
 _TYPES = {kind.name: kind for kind in AgentType}
-_LIGHTS = {f"LANE_STATE_{state.name}": state for state in SignalState} | {
-    "TRAFFIC_LIGHT_GREEN": SignalState.GO,
-    "TRAFFIC_LIGHT_YELLOW": SignalState.CAUTION,
-    "TRAFFIC_LIGHT_RED": SignalState.STOP,
-    "TRAFFIC_LIGHT_UNKNOWN": SignalState.UNKNOWN,
-    "None": SignalState.UNKNOWN,
-}
-_LANES = {
-    "LANE_SURFACE_STREET": LaneType.SURFACE_STREET,
-    "LANE_SURFACE_UNSTRUCTURE": LaneType.SURFACE_STREET,
-    "LANE_UNKNOWN": LaneType.UNDEFINED,
-    "LANE_FREEWAY": LaneType.FREEWAY,
-    "LANE_BIKE_LANE": LaneType.BIKE_LANE,
-}
+_COLORS = {"GREEN": SignalState.GO, "YELLOW": SignalState.CAUTION, "RED": SignalState.STOP}
+_LIGHTS = {f"LANE_STATE_{state.name}": state for state in SignalState}
+_LIGHTS |= {f"TRAFFIC_LIGHT_{color}": state for color, state in _COLORS.items()}
+_LIGHTS |= dict.fromkeys(("TRAFFIC_LIGHT_UNKNOWN", "None"), SignalState.UNKNOWN)
+_STREETS = ("LANE_SURFACE_STREET", "LANE_SURFACE_UNSTRUCTURE")
+_LANES = {"LANE_UNKNOWN": LaneType.UNDEFINED, "LANE_FREEWAY": LaneType.FREEWAY}
+_LANES |= {"LANE_BIKE_LANE": LaneType.BIKE_LANE, **dict.fromkeys(_STREETS, LaneType.SURFACE_STREET)}
 _AREAS = {kind.name: kind for kind in (MarkType.CROSSWALK, MarkType.SPEED_BUMP, MarkType.DRIVEWAY)}
 _NO_LIMITS = frozenset({"nuscenes", "av2"})
 """Datasets without speed limits: ScenarioNet writes 100 km/h for connectors, and 85 mph for all lanes."""

@@ -46,12 +46,7 @@ class Generated(NamedTuple):
 
 
 def generate_run(
-    kind: str,
-    seed: int,
-    duration: float = 150.0,
-    *,
-    rule: CropRule | None = None,
-    straight: float = 1.0,
+    kind: str, seed: int, duration: float = 150.0, *, rule: CropRule | None = None, straight: float = 1.0
 ) -> Generated:
     """Make one network, simulate its traffic once and cut run segments at 5 Hz out of it.
 

@@ -28,29 +28,17 @@ _TURN, _NEAR, _SPEED_CHANGE = 0.5, 6.0, 4.0
 
 @dataclass(frozen=True)
 class CropRule:
-    """How maps and egos are chosen.
+    """How maps and egos are chosen; distances in metres."""
 
-    Attributes:
-        radius: metres around the focus that the map covers.
-        ego_radius: metres within which the ego stays throughout, so that road lies ahead of it.
-        agent_radius: metres within which other vehicles are seen.
-        partner_distance: metres from the ego to the nearest other vehicle that moves, at the first step.
-        focuses: how many points of the network, at most.
-        per_focus: how many segments share one map, at most.
-        steps: of a segment, its first state included.
-        interactive: moving vehicles a segment must have at its first step (N_I).
-        turn_interest: what a turn adds to a vehicle's chance of being the ego, where driving on has 0.3.
-    """
-
-    radius: float = 110.0
-    ego_radius: float = 78.0
-    agent_radius: float = 95.0
-    partner_distance: float = 40.0
-    focuses: int = 6
-    per_focus: int = 12
-    steps: int = 51
-    interactive: int = 2
-    turn_interest: float = 1.2
+    radius: float = 110.0  # around the focus, that the map covers
+    ego_radius: float = 78.0  # within which the ego stays throughout, so that road lies ahead of it
+    agent_radius: float = 95.0  # within which other vehicles are seen
+    partner_distance: float = 40.0  # from the ego to the nearest other vehicle that moves, at the first step
+    focuses: int = 6  # points of the network, at most
+    per_focus: int = 12  # segments that share one map, at most
+    steps: int = 51  # of a segment, its first state included
+    interactive: int = 2  # moving vehicles a segment must have at its first step (N_I)
+    turn_interest: float = 1.2  # what a turn adds to the chance of being the ego, where driving on has 0.3
 
 
 def crop_rule(kind: str, seconds: float = 10.0, interactive: int = 2) -> CropRule:

@@ -390,9 +390,6 @@ def own_network(file: Path, folder: Path) -> Path:
         return folder / "net.net.xml"
 
 
-NETWORKS: dict[str, Callable[[np.random.Generator, Path], Path]] = {
-    "town": town,
-    "grid": grid,
-    "ramp": freeway,
-}
+Maker = Callable[[np.random.Generator, Path], Path]
+NETWORKS: dict[str, Maker] = {"town": town, "grid": grid, "ramp": freeway}
 """Kinds of network; each function writes files into a folder and returns the path of the network."""

@@ -30,33 +30,19 @@ BOUNDARY_MARGIN = 25.0
 
 @dataclass(frozen=True)
 class Network:
-    """A compiled network.
+    """A compiled network; of its L lanes, those of one edge follow each other from right to left."""
 
-    Attributes:
-        lanes: centre lines in the direction of travel, connectors inside junctions included.
-        width: [L] metres.
-        speed: [L] m/s.
-        internal: [L] bool, the lane is a connector inside a junction.
-        edge: [L] index of the lane's edge; lanes of one edge follow each other from right to left.
-        edge_names: SUMO's names of the edges.
-        successors: [E, 2] lanes (from, to).
-        connectors: per traffic light, its (link index, the connector it controls, the lane that leads there).
-        stop_lanes: the rightmost lane of each edge that ends at a stop sign.
-        junction_shapes: the paved area of each junction.
-        centers: [J, 2] junctions where at least three streets meet or lanes split or join.
-    """
-
-    lanes: list[Doubles]
-    width: Doubles
-    speed: Doubles
-    internal: Bools
-    edge: NDArray[np.int64]
+    lanes: list[Doubles]  # centre lines in the direction of travel, connectors inside junctions included
+    width: Doubles  # [L] metres
+    speed: Doubles  # [L] m/s
+    internal: Bools  # [L] whether the lane is a connector inside a junction
+    edge: NDArray[np.int64]  # [L] index of the lane's edge
     edge_names: list[str]
-    successors: NDArray[np.int64]
-    connectors: dict[str, list[tuple[int, int, int]]]
-    stop_lanes: list[int]
-    junction_shapes: list[Doubles]
-    centers: Doubles
+    successors: NDArray[np.int64]  # [E, 2] lanes (from, to)
+    connectors: dict[str, list[tuple[int, int, int]]]  # per light (link, connector it controls, lane before)
+    stop_lanes: list[int]  # the rightmost lane of each edge that ends at a stop sign
+    junction_shapes: list[Doubles]  # the paved area of each junction
+    centers: Doubles  # [J, 2] junctions where at least three streets meet or lanes split or join
 
     def sources(self) -> list[int]:
         """Return the edges for traffic that nothing leads into."""
@@ -164,23 +150,14 @@ def read_network(file: Path) -> Network:
 
 @dataclass(frozen=True)
 class Crop:
-    """The map around a point, and the traffic lights on it.
-
-    Attributes:
-        road: the map, with ``center`` as its origin.
-        center: [2] in the network's frame.
-        signals: per light on the map, (traffic light, link index).
-        signal_lane: [Q] the connector it controls.
-        signal_point: [Q, 3] the stop point: end of the lane that leads to the connector.
-        drivable: the drivable area, in the map's frame.
-    """
+    """The map around a point, which is its origin, and the Q traffic lights on it."""
 
     road: RoadMap
-    center: Doubles
-    signals: list[tuple[str, int]]
-    signal_lane: NDArray[np.int32]
-    signal_point: Floats
-    drivable: Polygon | MultiPolygon
+    center: Doubles  # [2] in the network's frame
+    signals: list[tuple[str, int]]  # per light on the map, (traffic light, link index)
+    signal_lane: NDArray[np.int32]  # [Q] the connector it controls
+    signal_point: Floats  # [Q, 3] the stop point: end of the lane that leads to the connector
+    drivable: Polygon | MultiPolygon  # in the map's frame
 
 
 def crop_network(network: Network, center: Doubles, radius: float) -> Crop:

@@ -129,23 +129,14 @@ def write_demand(
 
 @dataclass(frozen=True)
 class Traffic:
-    """Tracks of all V vehicles and all lights at N times, in the network's frame.
+    """Tracks of all V vehicles and all lights at N times, in the network's frame; NaN where a vehicle is absent."""
 
-    Attributes:
-        size: [V, 3] boxes.
-        position: [V, N, 2] box centres; NaN where the vehicle is absent.
-        heading: [V, N] unwrapped along time; NaN where absent.
-        velocity: [V, N, 2] m/s; NaN where absent.
-        present: [V, N] bool.
-        lights: per traffic light, [links, N] uint8 :class:`SignalState`.
-    """
-
-    size: Floats
-    position: Doubles
-    heading: Doubles
-    velocity: Doubles
-    present: Bools
-    lights: dict[str, NDArray[np.uint8]]
+    size: Floats  # [V, 3] boxes
+    position: Doubles  # [V, N, 2] box centres
+    heading: Doubles  # [V, N] unwrapped along time
+    velocity: Doubles  # [V, N, 2] m/s
+    present: Bools  # [V, N]
+    lights: dict[str, NDArray[np.uint8]]  # per traffic light, [links, N] signal states
 
 
 def simulate_traffic(
