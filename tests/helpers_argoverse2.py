@@ -33,19 +33,10 @@ def track(
 ) -> None:
     """Add a track at constant speed along +x (or -x)."""
     for step in steps:
-        row = {
-            "track_id": name,
-            "object_type": kind,
-            "object_category": category,
-            "timestep": step,
-            "observed": step < 8,
-            "position_x": FAR[0] + start[0] + speed * 0.1 * step,
-            "position_y": FAR[1] + start[1],
-            "heading": 0.0 if speed >= 0 else np.pi,
-            "velocity_x": speed,
-            "velocity_y": 0.0,
-        }
-        for key, value in row.items():
+        who = {"track_id": name, "object_type": kind, "object_category": category, "timestep": step}
+        place = {"position_x": FAR[0] + start[0] + speed * 0.1 * step, "position_y": FAR[1] + start[1]}
+        motion = {"heading": 0.0 if speed >= 0 else np.pi, "velocity_x": speed, "velocity_y": 0.0}
+        for key, value in {**who, "observed": step < 8, **place, **motion}.items():
             columns.setdefault(key, []).append(value)
 
 
@@ -58,13 +49,6 @@ def scenario(steps: int = 20) -> Columns:
     track(columns, "8", "cyclist", range(steps), (30, -3), 4.0)
     track(columns, "9", "static", range(3, 5), (40, 11), 0.0, category=0)
     track(columns, "AV", "vehicle", range(steps), CARS["AV"], CARS["AV"][2])
-    return finished(columns)
-
-
-def finished(columns: Columns, steps: int | None = None) -> Columns:
-    """With the columns that are the same in every row."""
-    count = len(columns["timestep"])
-    steps = steps or max(columns["timestep"]) + 1
     same = {
         "scenario_id": NAME,
         "focal_track_id": "102",
@@ -74,7 +58,7 @@ def finished(columns: Columns, steps: int | None = None) -> Columns:
         "city": "austin",
         "map_id": 74806,
     }
-    return columns | {name: [value] * count for name, value in same.items()}
+    return columns | {name: [value] * len(columns["timestep"]) for name, value in same.items()}
 
 
 def lane(
@@ -83,21 +67,14 @@ def lane(
     """A straight lane from ``begin`` to ``end`` (towards -x where that is less)."""
     side = np.sign(end - begin) * width / 2
     middle = (begin + end) / 2
-    node = {
-        "id": lane_id,
-        "is_intersection": False,
-        "lane_type": "VEHICLE",
+    lines = {
         "centerline": points([(begin, y), (middle, y), (end, y)]),
         "left_lane_boundary": points([(begin, y + side), (end, y + side)]),
         "right_lane_boundary": points([(begin, y - side), (middle, y - side), (end, y - side)]),
-        "left_lane_mark_type": "NONE",
-        "right_lane_mark_type": "NONE",
-        "successors": [],
-        "predecessors": [],
-        "left_neighbor_id": None,
-        "right_neighbor_id": None,
     }
-    return node | changes
+    paint = dict.fromkeys(("left_lane_mark_type", "right_lane_mark_type"), "NONE")
+    links = {"successors": [], "predecessors": [], "left_neighbor_id": None, "right_neighbor_id": None}
+    return {"id": lane_id, "lane_type": "VEHICLE", **lines, **paint, **links, **changes}
 
 
 def city() -> dict[str, Any]:

@@ -11,21 +11,9 @@ EARTH = 6_378_137.0
 ORIGIN = (49.01, 8.43)
 """Latitude and longitude of the made recordings' origin."""
 
-NODES = {
-    1: (0, 0),
-    2: (50, 0),
-    3: (0, 4),
-    4: (50, 4),
-    5: (0, 8),
-    6: (50, 8),
-    7: (100, 0),
-    8: (100, 4),
-    9: (100, 8),
-    10: (46, -3),
-    11: (46, 11),
-    12: (50, -3),
-    13: (50, 11),
-}
+PLACES = [(0, 0), (50, 0), (0, 4), (50, 4), (0, 8), (50, 8), (100, 0), (100, 4), (100, 8)]
+PLACES += [(46, -3), (46, 11), (50, -3), (50, 11)]
+NODES = dict(enumerate(PLACES, start=1))
 BORDER, DASHED = {"type": "road_border"}, {"type": "line_thin", "subtype": "dashed"}
 WAYS = {
     21: ((1, 2), BORDER),
@@ -83,20 +71,23 @@ def osm(
 ) -> str:
     """A map: by default two lanes of 100 m in two parts each, along +x, between y = 0 and 8."""
     parts = [node(name, *place, how) for name, place in nodes.items()]
+
+    def element(kind: str, name: int, inner: Iterable[str], tags: Mapping[str, str]) -> None:
+        parts.append(f"<{kind} id='{name}'>{''.join(inner)}{tag(tags)}</{kind}>")
+
     for name, (refs, tags) in ways.items():
-        inner = "".join(f"<nd ref='{ref}'/>" for ref in refs)
-        parts.append(f"<way id='{name}'>{inner}{tag(tags)}</way>")
+        element("way", name, (f"<nd ref='{ref}'/>" for ref in refs), tags)
     for name, (left, right, tags, mine) in lanelets.items():
-        inner = (
-            f"<member type='way' ref='{left}' role='left'/><member type='way' ref='{right}' role='right'/>"
-        )
-        inner += "".join(f"<member type='relation' ref='{rule}' role='regulatory_element'/>" for rule in mine)
-        parts.append(f"<relation id='{name}'>{inner}{tag(tags)}</relation>")
+        inner = [member("way", left, "left"), member("way", right, "right")]
+        element("relation", name, inner + [member("relation", r, "regulatory_element") for r in mine], tags)
     for name, (tags, lines) in rules.items():
-        inner = "".join(f"<member type='way' ref='{ref}' role='{role}'/>" for role, ref in lines.items())
-        every = tag({"type": "regulatory_element", **tags})
-        parts.append(f"<relation id='{name}'>{inner}{every}</relation>")
+        inner = [member("way", ref, role) for role, ref in lines.items()]
+        element("relation", name, inner, {"type": "regulatory_element", **tags})
     return f"<?xml version='1.0' encoding='UTF-8'?>\n<osm version='0.6'>{''.join(parts)}</osm>\n"
+
+
+def member(kind: str, ref: int | str, role: str) -> str:
+    return f"<member type='{kind}' ref='{ref}' role='{role}'/>"
 
 
 LOT = {41: (50, 8), 42: (50, 28), 43: (80, 28), 44: (80, 8), 51: (60, 15), 52: (70, 15), 53: (65, 25)}
@@ -117,10 +108,9 @@ def with_area(
         for (name, refs), turn in zip(FENCES.items(), turned, strict=True)
     }
     roles = {"o": "outer", "i": "inner"}
-    inner = "".join(f"<member type='way' ref='{m[:-1]}' role='{roles[m[-1]]}'/>" for m in members.split())
-    every = tag({"type": "multipolygon", **tags})
-    content = osm(nodes=NODES | LOT, ways=WAYS | ways)
-    return content.replace("</osm>", f"<relation id='301'>{inner}{every}</relation></osm>")
+    inner = "".join(member("way", m[:-1], roles[m[-1]]) for m in members.split())
+    relation = f"<relation id='301'>{inner}{tag({'type': 'multipolygon', **tags})}</relation>"
+    return osm(nodes=NODES | LOT, ways=WAYS | ways).replace("</osm>", f"{relation}</osm>")
 
 
 COLUMNS = "track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy,psi_rad,length,width"

@@ -50,18 +50,10 @@ def womd_scenario(name: str = "0123456789abcdef", tracks: int = 3, steps: int = 
     for k in range(tracks):
         track = scenario.tracks.add(id=100 + k, object_type=1)
         for step in range(steps):
-            track.states.add(
-                center_x=FAR[0] + 5 * k + (10 + k) * 0.1 * step,
-                center_y=FAR[1] + 4 * (k % 2),
-                center_z=FAR[2],
-                length=4.5 + k,
-                width=2.0,
-                height=1.5,
-                heading=0.01 * k,
-                velocity_x=10 + k,
-                velocity_y=0.5,
-                valid=True,
-            )
+            x, y, z = FAR + np.array([5 * k + (10 + k) * 0.1 * step, 4 * (k % 2), 0])
+            box = {"length": 4.5 + k, "width": 2.0, "height": 1.5, "heading": 0.01 * k}
+            motion = {"velocity_x": 10 + k, "velocity_y": 0.5}
+            track.states.add(center_x=x, center_y=y, center_z=z, **box, **motion, valid=True)
     for y, first in ((0.0, 10), (4.0, 20)):
         for part, start in enumerate((0.0, 50.0)):
             feature = scenario.map_features.add(id=first + part)
@@ -71,14 +63,10 @@ def womd_scenario(name: str = "0123456789abcdef", tracks: int = 3, steps: int = 
             (feature.lane.entry_lanes if part else feature.lane.exit_lanes).append(first + 1 - part)
             near = feature.lane.left_neighbors if first == 10 else feature.lane.right_neighbors
             near.add(feature_id=30 - first + part)
-    edge = scenario.map_features.add(id=30)
-    edge.road_edge.type = 1
+    edge, line, crosswalk, sign = (scenario.map_features.add(id=k) for k in (30, 40, 50, 60))
     womd_points(edge.road_edge.polyline, [(0, -2), (100, -2)])
-    line = scenario.map_features.add(id=40)
     womd_points(line.road_line.polyline, [(0, 2), (50, 2), (100, 2)])
-    crosswalk = scenario.map_features.add(id=50)
     womd_points(crosswalk.crosswalk.polygon, [(48, -2), (50, -2), (50, 6), (48, 6)])
-    sign = scenario.map_features.add(id=60)
     sign.stop_sign.lane.append(20)
     sign.stop_sign.position.CopyFrom(pb.MapPoint(x=FAR[0] + 48, y=FAR[1] + 7, z=FAR[2]))
     for step in range(steps):

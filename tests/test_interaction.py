@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -48,18 +49,13 @@ def test_tracks_of_the_public_layout(tmp_path: Path) -> None:
 def test_windows_of_a_recording(tmp_path: Path) -> None:
     path = public(tmp_path, track(3, steps=range(256)))
     found = segments(path)
-    assert [(s.segment_id, s.num_steps) for s in found] == [
-        ("DR_X_000_t0", 101),
-        ("DR_X_000_t10", 101),
-        ("DR_X_000_t20", 56),
-    ]
-    assert {s.group for s in found} == {"DR_X_000"}
+    names = [f"DR_X_000_t{start}" for start in (0, 10, 20)]
+    assert [(s.segment_id, s.num_steps) for s in found] == list(zip(names, (101, 101, 56), strict=True))
     np.testing.assert_allclose(found[1].position[:, 0], found[0].position[:, 100])
-    # A rest of less than half a window is left out; so is none of it where windows overlap.
+    assert [s.segment_id for s in segments(path, window=5, stride=10)] == names
+    assert len(segments(path, window=20, stride=0.5)) == 32
+    # A rest of less than half a window is left out.
     assert [s.num_steps for s in segments(public(tmp_path, track(3, steps=range(250))))] == [101, 101]
-    starts = [s.segment_id for s in segments(path, window=5, stride=10)]
-    assert starts == ["DR_X_000_t0", "DR_X_000_t10", "DR_X_000_t20"]
-    assert len(segments(path, window=20, stride=0.5)) == 30
 
 
 def test_egos(tmp_path: Path) -> None:
@@ -142,18 +138,21 @@ def test_velocities_that_are_not_those_of_the_positions(factor: float, tmp_path:
 
 
 def test_headings_that_are_not_those_of_the_motion(tmp_path: Path) -> None:
-    path = public(tmp_path, [row.replace(",0.0,0.0,4.5", ",0.0,3.1,4.5") for row in raw()])
+    def turned(rows: list[str], angle: float) -> list[str]:
+        return [row.replace(",0.0,0.0,4.5", f",0.0,{angle},4.5") for row in rows]
+
+    path = public(tmp_path, turned(raw(), 3.1))
     assert read_error("interaction", path).field == "psi_rad"
     np.testing.assert_allclose(read_one("interaction", path, motion="positions").heading, 0, atol=1e-3)
     # What stands before it moves is turned as well, and small differences are none.
-    rows = [row.replace("0.0,0.0,4.5", "0.0,2.5,4.5") for row in track(0, speed=0, steps=range(30))]
-    rows += [row.replace("0.0,0.0,4.5", "0.0,0.3,4.5") for row in track(0, x=-30, steps=range(30, 120))]
+    rows = turned(track(0, speed=0, steps=range(30)), 2.5) + turned(
+        track(0, x=-30, steps=range(30, 120)), 0.3
+    )
     both = read_one("interaction", public(tmp_path, rows), motion="positions").heading[0]
-    np.testing.assert_allclose(both[:30], 0, atol=1e-3)
-    np.testing.assert_allclose(both[30:], 0.3, atol=1e-6)
+    np.testing.assert_allclose(both, np.where(np.arange(101) < 30, 0, 0.3), atol=1e-3)
     # One that stands keeps the heading that was logged.
-    stands = [row.replace(",0.0,0.0,4.5", ",0.0,1.25,4.5") for row in track(9, x=20, speed=0)]
-    still = read_one("interaction", public(tmp_path, [*raw(), *stands]), motion="positions")
+    rows = [*raw(), *turned(track(9, x=20, speed=0), 1.25)]
+    still = read_one("interaction", public(tmp_path, rows), motion="positions")
     np.testing.assert_allclose(still.heading[3], 1.25, rtol=1e-6)
 
 
@@ -171,19 +170,14 @@ def test_states_logged_twice(tmp_path: Path) -> None:
 GOOD = text(CARS)
 BROKEN = [
     ("", "empty"),
-    (COLUMNS + "\n", "no rows"),
     (GOOD[:-1], "cut short"),
     (GOOD.replace(",vy,", ",v,", 1), "0 columns of that name"),
-    (GOOD.replace("frame_id", "x", 1), "2 columns of that name"),
     (GOOD.replace(",car,", ",", 1), "10 fields, expected 11"),
-    (GOOD.replace(",2.0000,", ",two,", 1), "'two' can't be read"),
     (GOOD.replace(",2.0000,", ",inf,", 1), "'inf' can't be read"),
     (GOOD.replace(",2.0000,", ",,", 1), "'' can't be read"),
     (GOOD.replace(",car,", ",cow,", 1), "'cow' can't be read"),
-    (GOOD.replace("\n3,", "\n3;,", 1), "'3;' can't be read"),
     (GOOD.replace(",100,car", ",100.5,car", 1), "no multiples of their usual step"),
     (GOOD.replace(",100,car", ",130,car"), "no multiples of their usual step"),
-    (text(track(3, steps=range(1))), "fewer than two steps"),
     (GOOD.replace("car", "autó", 1), "UnicodeDecodeError"),
     (GOOD.replace(",car,", ",truck,", 1).replace(",truck,", ",bicycle,", 1), "more than one"),
     (GOOD.replace(",4.5,2.0", ",,"), "length and width must be positive"),
@@ -206,21 +200,15 @@ COMPANIONS = [
     (MAP, "<osm/>", "has no lanelets"),
     (META_DATA, None, "away from the map"),  # another projection
     (META_DATA, META.replace("001", "002"), "0 rows for recording 001"),
-    (META_DATA, META.replace("originLat", "lat"), "is not a number"),
-    (META_DATA, META.replace("yes", "maybe"), "neither yes nor no"),
     (META_DATA, META[:-1], "cut short"),
     (SIGNALS, None, "are missing"),
-    (SIGNALS, "a,b\n", "expected rows of"),
     (SIGNALS, PHASES[:-1], "cut short"),
     (SIGNALS, PHASES.replace("DARK", "PINK"), "is no phase"),
-    (SIGNALS, PHASES.replace("\n7,", "\nx,", 1), "is not an integer"),
     (SIGNALS, PHASES.replace("2000", "1000"), "has two states"),
     (SIGNALS, PHASES.replace("000,", ","), "the tracks at 11900 ms"),
     (LANES, None, "are missing"),
-    (LANES, "<kml xmlns='http://www.opengis.net/kml/2.2'/>", "no lanes with a signal group"),
     (LANES, KML.replace("<kml", "<!DOCTYPE kml><kml", 1), "document type"),
     (LANES, KML.replace("7, 8", "17, 18").replace(">8<", ">18<"), "fits a lane"),
-    (LANES, KML.replace(">2<", "><", 1), "is not one lane"),
     (LANES, KML.replace(">2<", ">2, 3<", 1), "is not one lane"),
     (LANES, KML.replace("7, 8", "7"), "1 for 2 sinks"),
 ]
@@ -269,9 +257,9 @@ def test_samples(samples: Path) -> None:
     assert clean.segments == 1
 
 
-def crossings(found: list[RunSegment]) -> dict[SignalState, int]:
+def crossings(found: list[RunSegment]) -> Counter[int]:
     """How many cars enter a lane with a light, by its state."""
-    counts: dict[SignalState, int] = {}
+    counts: Counter[int] = Counter()
     for s in found:
         for light, lane in enumerate(s.signal_lane):
             line = s.road.lanes[lane][:, :2]
@@ -281,7 +269,5 @@ def crossings(found: list[RunSegment]) -> dict[SignalState, int]:
             enters = (ahead[:, :-1] < 0) & (ahead[:, 1:] >= 0) & (np.abs(aside[:, 1:]) < 1.5)
             enters &= s.valid[:, :-1] & s.valid[:, 1:] & (s.agent_type == AgentType.VEHICLE)[:, None]
             enters &= np.cos(s.heading[:, 1:] - np.arctan2(along[1], along[0])) > 0.9
-            for _, step in zip(*enters.nonzero(), strict=True):
-                state = SignalState(s.signal_state[light, step])
-                counts[state] = counts.get(state, 0) + 1
+            counts.update(s.signal_state[light, enters.nonzero()[1]].tolist())
     return counts

@@ -15,11 +15,9 @@ from helpers_interaction import BORDER, DASHED, LANELETS, ORIGIN, PARKING, ROAD,
 from helpers_sources import off_road
 from symphony.data.segment import LaneType, MarkType, RoadMap
 from symphony.data.sources.lanelet2 import (
-    FLATTENING,
     NO_AREA,
     NO_LANELET,
     NO_NODE,
-    SEMI_MAJOR,
     LaneletMap,
     lane_lanelets,
     mercator,
@@ -106,9 +104,7 @@ def test_the_direction_ways_are_drawn_in_does_not_matter(
     ("tags", "left", "right"),
     [
         (DASHED, True, True),
-        ({}, True, True),
         (BORDER, False, False),
-        ({"type": "curbstone"}, False, False),
         ({"type": "line_thin", "subtype": "solid_solid"}, False, False),
         ({"type": "line_thin", "subtype": "solid", "lane_change": "yes"}, True, True),
         ({"type": "line_thin", "subtype": "dashed", "lane_change": "no"}, False, False),
@@ -151,15 +147,11 @@ def test_areas_belong_to_the_road_but_for_their_holes(
 
 
 BROKEN = {
-    "this is no map": "not well-formed XML",
     "": "empty",
-    "<gpx/>": "not an OSM file",
     osm().replace("<osm", "<!DOCTYPE osm><osm", 1): "document type",
-    "<!DOCTYPE osm [<!ENTITY a 'b'>]><osm>&a;</osm>": "document type, which OSM files never do",
     osm(lanelets={}): "has no lanelets",
     osm(lanelets={105: LANELETS[105]}): "has no lanes",
     osm(lanelets={101: (22, 99, ROAD, ())}): "there is no way 99",
-    osm().replace("x='50'", "x='fifty'", 1): "is not a number",
     osm().replace("x='50'", "x='inf'", 1): "not finite",
     osm().replace("x='50'", "", 1): "is not a number",
     osm("degrees").replace("lat='49.", "lat='89.", 1): "outside latitudes",
@@ -182,11 +174,8 @@ def test_broken_maps_are_refused_by_name(content: str, tmp_path: Path) -> None:
         (osm(ways=WAYS | {21: ((1, 77), BORDER)}), NO_NODE, "node 77"),
         (osm(ways=WAYS | {21: ((1,), BORDER)}), NO_LANELET, "two points"),
         (with_area(PARKING, members="61o 62o"), NO_AREA, "is not closed"),
-        (with_area(PARKING, members="61o 64o"), NO_AREA, "is not closed"),
-        (with_area(PARKING, members="64i 65i"), NO_AREA, "0 outlines"),
         (with_area(PARKING, members="61o 62o 63o 64o 65o"), NO_AREA, "2 outlines"),
         (with_area(PARKING, members="61o 99o"), NO_AREA, "there is no way 99"),
-        (with_area(PARKING, members="61o 61o"), NO_AREA, "is not closed"),
     ],
 )
 def test_what_a_map_lacks_is_left_out(content: str, kind: str, example: str, tmp_path: Path) -> None:
@@ -215,8 +204,6 @@ def test_sample_maps(samples: Path) -> None:
 
 # Projections
 
-LATITUDES, LONGITUDES = st.floats(-80, 80), st.floats(-179, 179)
-
 
 @pytest.mark.parametrize(
     ("origin", "place", "by_utm", "by_mercator"),
@@ -231,32 +218,6 @@ def test_agrees_with_proj(origin: Any, place: Any, by_utm: Any, by_mercator: Any
     for project, expected in ((utm, by_utm), (mercator, by_mercator)):
         found = project(np.array([place, origin], float), np.array(origin, float))
         np.testing.assert_allclose(found, [expected, (0, 0)], atol=1e-4)
-
-
-@given(LATITUDES, LONGITUDES, st.floats(-np.pi, np.pi))
-def test_utm_is_conformal_and_true_to_scale(latitude: float, longitude: float, course: float) -> None:
-    """A short step on the ellipsoid keeps its length, to the scale of the grid, and angles between steps."""
-    squared = FLATTENING * (2 - FLATTENING)
-    root = np.sqrt(1 - squared * np.sin(np.radians(latitude)) ** 2)
-    north = SEMI_MAJOR * (1 - squared) / root**3
-    east = SEMI_MAJOR / root * np.cos(np.radians(latitude))
-    origin = np.array([latitude, longitude])
-    turns = course + np.array([0, np.pi / 2])
-    found = utm(origin + np.degrees(np.stack([np.sin(turns) / north, np.cos(turns) / east], axis=-1)), origin)
-    lengths = np.hypot(*found.T)
-    # 0.9996 on the zone's meridian, about 1.0010 at its edge.
-    assert (np.abs(lengths - 1.0003) < 0.0008).all()
-    assert lengths[0] == pytest.approx(lengths[1], rel=1e-5)
-    across = found[0, 0] * found[1, 1] - found[0, 1] * found[1, 0]
-    assert across == pytest.approx(lengths[0] * lengths[1], rel=1e-5)
-
-
-@given(LATITUDES, LONGITUDES)
-def test_mercator_points_north_and_east(latitude: float, longitude: float) -> None:
-    origin = np.array([latitude, longitude])
-    step = np.degrees(1 / SEMI_MAJOR)
-    found = mercator(origin + np.array([[step, 0], [0, step / np.cos(np.radians(latitude))]]), origin)
-    np.testing.assert_allclose(found, [[0, 1], [1, 0]], atol=1e-5)
 
 
 @pytest.mark.parametrize("place", [(85, 0), (-90, 0), (0, 181), (np.nan, 0), (0, np.inf)])

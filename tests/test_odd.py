@@ -112,23 +112,24 @@ def test_rates_of_recordings(rate: float, whole: bool) -> None:
 # Agents and states
 
 
+def sized(agent: int, sides: tuple[float, float, float]) -> RunSegment:
+    size = scene().size.copy()
+    size[agent] = sides
+    return scene(size=size)
+
+
 def test_boxes_without_a_size() -> None:
     whole = scene()
-    for sides in ((0, 0, 0), (-1, -1, -1), (np.nan,) * 3, (200, 1, 1)):
-        size = whole.size.copy()
-        size[1] = sides
-        found = validate(mended(whole.replace(size=size)))
+    for sides in ((0, 0, 0), (np.nan,) * 3, (200, 1, 1)):
+        found = validate(mended(sized(1, sides)))
         assert found.odd == {NO_SIZE: f"agent {whole.agent_id[1]}"}
         assert found.agent_id.tolist() == [whole.agent_id[k] for k in (0, 2)]
-        size[[0, 1]] = size[[1, 0]]
         with pytest.raises(DataError):  # the ego's
-            validate(mended(whole.replace(size=size)))
-    size = whole.size.copy()
-    size[1], size[2, 2] = (0.04, 0.04, 0.8), np.nan
-    found = validate(mended(whole.replace(size=size)))
+            validate(mended(sized(0, sides)))
+    found = validate(mended(sized(1, (0.04, 0.04, 0.8))))
     assert found.odd == {THIN: f"agent {whole.agent_id[1]}"}
     np.testing.assert_array_equal(found.size[1], np.float32([0.05, 0.05, 0.8]))
-    assert found.size[2, 2] == 0
+    assert validate(mended(sized(2, (4, 2, np.nan)))).size[2, 2] == 0
 
 
 @given(st.integers(0, 90), st.sampled_from([3000.0, 1e5, np.nan, np.inf]))

@@ -12,12 +12,10 @@ from helpers_segments import crossing, straight_road
 from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.resample import resample
-from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
-from symphony.envs import DrivingEnv, collate, scene
+from symphony.envs import collate, scene
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
-from symphony.learning import SceneDataset
 from symphony.recipes import train
 
 
@@ -44,15 +42,6 @@ def test_constant_velocity_is_as_far_off_at_any_rate(stores: dict[float, Path]) 
     assert found[0.2]["ade"] > 0.5
     # The mean is over steps, and the finer ones lie between the coarser.
     assert found[0.1]["ade"] == pytest.approx(found[0.2]["ade"], rel=0.1)
-
-
-def test_an_environment_steps_as_its_scenes_do(stores: dict[float, Path]) -> None:
-    for dt, path in stores.items():
-        data = SceneDataset(SegmentStore(path))
-        assert data.dt == pytest.approx(dt)
-        env = DrivingEnv(data)
-        env.reset()
-        assert env.dt == pytest.approx(dt)
 
 
 def test_agents_refuse_another_rate_than_they_learned(

@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from helpers_sources import FAR, read_error, read_one, womd_scenario
 from symphony.data.odd import NO_LINE, NO_SIZE, WILD
@@ -75,32 +73,23 @@ def test_tracks(path: Path) -> None:
     assert (segment.predict.tolist(), segment.interest.tolist()) == ([0], [0, 1])
 
 
-def test_invalid_states_are_zero_whatever_they_hold(path: Path) -> None:
-    scenario = womd_scenario()
+def test_what_is_not_valid_is_zero_and_tracks_never_seen_are_left_out(path: Path) -> None:
+    scenario = womd_scenario(tracks=4)
     hidden = scenario.tracks[0].states[3]
     hidden.valid, hidden.center_x, hidden.heading, hidden.velocity_x = False, np.nan, np.inf, 1e30
-    segment = convert(path, scenario)
-    np.testing.assert_array_equal(segment.valid[0], [True, True, True, False, True])
-    for field in (segment.position, segment.heading, segment.velocity):
-        assert not field[0, 3].any()
-
-
-def test_sizes_come_from_the_current_step_or_else_the_median(path: Path) -> None:
-    scenario = womd_scenario(tracks=3, steps=5)
-    for step, length in enumerate([4.0, 9.0, 5.0, 6.0, 90.0]):
-        for track in scenario.tracks[:2]:
-            track.states[step].length = length
-    scenario.tracks[1].states[1].valid = False
-    assert convert(path, scenario).size[:2, 0].tolist() == [9.0, 5.5]
-
-
-def test_tracks_never_seen_are_left_out_and_indices_follow(path: Path) -> None:
-    scenario = womd_scenario(tracks=4)
     for state in scenario.tracks[1].states:
         state.valid = False
     scenario.tracks_to_predict.add(track_index=1)
     scenario.tracks_to_predict.add(track_index=2)
+    # A size is that of the current step, or else the median.
+    for step, length in enumerate([4.0, 9.0, 5.0, 6.0, 90.0]):
+        scenario.tracks[0].states[step].length = scenario.tracks[2].states[step].length = length
+    scenario.tracks[2].states[1].valid = False
     segment = convert(path, scenario)
+    assert np.argwhere(~segment.valid).tolist() == [[0, 3], [1, 1]]
+    for field in (segment.position, segment.heading, segment.velocity):
+        assert not field[0, 3].any()
+    assert segment.size[:2, 0].tolist() == [9.0, 5.5]
     np.testing.assert_array_equal(segment.agent_id, [100, 102, 103])
     assert (segment.ego, segment.predict.tolist(), segment.interest.tolist()) == (2, [0, 1], [0])
 
@@ -161,14 +150,12 @@ def test_the_time_step_is_that_of_the_whole_log(path: Path, rate: int) -> None:
     ("change", "field"),
     [
         (lambda s: s.ClearField("scenario_id"), "scenario_id"),
-        (lambda s: s.ClearField("timestamps_seconds"), "timestamps_seconds"),
         (lambda s: s.timestamps_seconds.__setitem__(2, 0.9), "timestamps_seconds"),
         (lambda s: s.timestamps_seconds.__setitem__(2, np.nan), "timestamps_seconds"),
         (lambda s: s.ClearField("tracks"), "tracks"),
         (lambda s: s.tracks[0].states.pop(), "tracks.states"),
         (lambda s: setattr(s.tracks[1], "object_type", 9), "tracks.object_type"),
         (lambda s: setattr(s, "sdc_track_index", 3), "sdc_track_index"),
-        (lambda s: setattr(s, "sdc_track_index", -1), "sdc_track_index"),
         (lambda s: [setattr(x, "valid", False) for x in s.tracks[2].states], "sdc_track_index"),
         (lambda s: setattr(s, "current_time_index", 5), "current_time_index"),
         (lambda s: s.tracks_to_predict.add(track_index=7), "tracks_to_predict"),
@@ -186,10 +173,8 @@ def test_what_the_format_forbids_is_named(path: Path, change: Change, field: str
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        (lambda s: setattr(s.tracks[2].states[0], "center_x", np.nan), "position"),
         (lambda s: setattr(s.tracks[1], "id", 100), "agent_id"),
         (lambda s: setattr(s, "scenario_id", "a/b"), "segment_id"),
-        (lambda s: s.ClearField("map_features"), "road.lanes"),
         (lambda s: setattr(s.map_features[1], "id", 10), "road.lane_id"),
         (lambda s: setattr(s.map_features[0].lane, "speed_limit_mph", -5), "road.speed_limit"),
     ],
@@ -204,12 +189,9 @@ def test_what_the_schema_forbids_is_named(path: Path, change: Change, field: str
     ("change", "kind"),
     [
         (lambda s: setattr(s.tracks[0].states[2], "center_x", np.nan), WILD),
-        (lambda s: setattr(s.tracks[0].states[2], "center_y", 1e300), WILD),
         (lambda s: setattr(s.tracks[0].states[2], "center_y", 1e6), WILD),
         (lambda s: setattr(s.tracks[0].states[2], "heading", np.inf), WILD),
-        (lambda s: setattr(s.tracks[0].states[2], "velocity_y", np.nan), WILD),
         (lambda s: setattr(s.tracks[0].states[1], "length", 0), NO_SIZE),
-        (lambda s: setattr(s.tracks[0].states[1], "width", np.nan), NO_SIZE),
         (lambda s: setattr(s.map_features[0].lane.polyline[1], "z", np.nan), NO_LINE),
         (lambda s: setattr(s.map_features[4].road_edge.polyline[0], "x", np.inf), NO_LINE),
     ],
@@ -238,22 +220,6 @@ def test_a_name_that_is_no_text_is_refused(path: Path) -> None:
 # Files of records
 
 PAYLOADS = [b"first", b"", b"the third one"]
-
-
-def crc32c_bit_by_bit(data: bytes) -> int:
-    crc = 0xFFFFFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc >> 1) ^ (0x82F63B78 if crc & 1 else 0)
-    return crc ^ 0xFFFFFFFF
-
-
-@given(st.binary(max_size=200))
-def test_the_checksum_is_the_masked_crc_32c(data: bytes) -> None:
-    crc = crc32c_bit_by_bit(data)
-    rotated = (crc >> 15 | crc << 17) & 0xFFFFFFFF
-    assert masked_crc32c(data) == (rotated + 0xA282EAD8) % 2**32
 
 
 def framed(payload: bytes, length: int | None = None) -> bytes:
@@ -312,15 +278,13 @@ def real(samples: Path) -> RunSegment:
 
 
 @pytest.mark.samples
-def test_segment_tracks(real: RunSegment, summary: dict[str, Any]) -> None:
-    tracks = summary["tracks"]
+def test_a_real_record(real: RunSegment, summary: dict[str, Any]) -> None:
+    tracks, lanes = summary["tracks"], [f for f in summary["map_features"] if f["kind"] == "lane"]
     assert real.position.shape == (83, 91, 3)
     assert (real.segment_id, real.dt, real.current_step, real.ego) == ("637f20cafde22ff8", 0.1, 10, 82)
     np.testing.assert_array_equal(real.agent_id, [track["id"] for track in tracks])
-    assert np.bincount(real.agent_type).tolist() == [0, 70, 10, 3]
     np.testing.assert_array_equal(real.valid.sum(axis=1), [track["n_valid"] for track in tracks])
     np.testing.assert_array_equal(real.predict, [72, 43, 42])
-    assert len(real.interest) == 0
     logged = np.where(real.valid[..., None], real.position + real.origin, 0).sum(axis=1)
     for k, track in enumerate(tracks):
         sums, now = track["sum_valid"], track["state_at_current"]
@@ -330,51 +294,32 @@ def test_segment_tracks(real: RunSegment, summary: dict[str, Any]) -> None:
         np.testing.assert_allclose(velocity, [sums["velocity_x"], sums["velocity_y"]], atol=1e-3)
         if now["valid"]:
             np.testing.assert_allclose(real.size[k], [now["length"], now["width"], now["height"]], rtol=1e-6)
-
-
-@pytest.mark.samples
-def test_segment_map(real: RunSegment, summary: dict[str, Any]) -> None:
-    road = real.road
-    features = {kind: [] for kind in summary["n_map_features_by_type"]}
-    for feature in summary["map_features"]:
-        features[feature["kind"]].append(feature)
-    lanes = features["lane"]
-    assert len(lanes) == 199
-    np.testing.assert_array_equal(road.lane_id, [lane["id"] for lane in lanes])
-    np.testing.assert_array_equal(road.lane_type, [lane["lane_type_value"] for lane in lanes])
-    np.testing.assert_allclose(
-        road.speed_limit, [lane["speed_limit_mph"] * MPS or np.nan for lane in lanes], rtol=1e-6
-    )
+    np.testing.assert_array_equal(real.road.lane_id, [lane["id"] for lane in lanes])
+    np.testing.assert_array_equal(real.road.lane_type, [lane["lane_type_value"] for lane in lanes])
+    limits = [lane["speed_limit_mph"] * MPS or np.nan for lane in lanes]
+    np.testing.assert_allclose(real.road.speed_limit, limits, rtol=1e-6)
     index = {lane["id"]: k for k, lane in enumerate(lanes)}
-
-    def links(pick: Any) -> set[tuple[int, int]]:
-        return {(k, index[i]) for k, lane in enumerate(lanes) for i in pick(lane) if i in index}
-
-    assert set(map(tuple, road.successors.tolist())) == links(lambda lane: lane["exit_lanes"])
-    entries = links(lambda lane: lane["entry_lanes"])
-    assert {(b, a) for a, b in road.successors.tolist()} == entries
-    assert (np.bincount(road.successors[:, 0]) > 1).sum() == 20
-    for side, found in (("left", road.left_neighbors), ("right", road.right_neighbors)):
-        near = links(lambda lane, side=side: [n["feature_id"] for n in lane[f"{side}_neighbors"]])
-        assert set(map(tuple, found.tolist())) == near
-    for lines, expected in ((road.lanes, lanes), (road.boundary, features["road_edge"])):
+    left, right = (
+        [[n["feature_id"] for n in lane[f"{side}_neighbors"]] for lane in lanes] for side in ("left", "right")
+    )
+    for found, named in (
+        (real.road.successors, [lane["exit_lanes"] for lane in lanes]),
+        (real.road.successors[:, ::-1], [lane["entry_lanes"] for lane in lanes]),
+        (real.road.left_neighbors, left),
+        (real.road.right_neighbors, right),
+    ):
+        assert set(map(tuple, found.tolist())) == {
+            (k, index[i]) for k, ids in enumerate(named) for i in ids if i in index
+        }
+    edges = [feature for feature in summary["map_features"] if feature["kind"] == "road_edge"]
+    for lines, expected in ((real.road.lanes, lanes), (real.road.boundary, edges)):
         np.testing.assert_array_equal(np.diff(lines.offsets), [line["n_points"] for line in expected])
-        for k, line in enumerate(expected):
-            np.testing.assert_allclose(lines[k][0] + real.origin, line["first"], atol=2e-5)
-            length = np.hypot(*np.diff(lines[k][:, :2].astype(float), axis=0).T).sum()
-            assert length == pytest.approx(line["length_xy"], abs=2e-3)
-    kinds = [MarkType.ROAD_LINE, MarkType.CROSSWALK, MarkType.SPEED_BUMP, MarkType.STOP_SIGN]
-    assert [int((road.mark_type == kind).sum()) for kind in kinds] == [59, 4, 3, 8]
-
-
-@pytest.mark.samples
-def test_segment_lights(real: RunSegment, summary: dict[str, Any]) -> None:
+        np.testing.assert_allclose(
+            lines.points[lines.offsets[:-1]] + real.origin, [line["first"] for line in expected], atol=2e-5
+        )
     rows = {lane: k for k, lane in enumerate(real.road.lane_id[real.signal_lane].tolist())}
-    assert len(rows) == 12
-    expected = np.zeros((12, 91), np.uint8)
-    for step, now in enumerate(summary["dynamic_map_states"]):
-        for light in now:
-            expected[rows[light["lane"]], step] = light["state"]
-            stop = real.signal_point[rows[light["lane"]]] + real.origin
-            np.testing.assert_allclose(stop, light["stop_point"], atol=1e-4)
-    np.testing.assert_array_equal(real.signal_state, expected)
+    states = np.zeros((12, 91), np.uint8)
+    for step, lights in enumerate(summary["dynamic_map_states"]):
+        for light in lights:
+            states[rows[light["lane"]], step] = light["state"]
+    np.testing.assert_array_equal(real.signal_state, states)
