@@ -180,15 +180,6 @@ def test_what_remembers_can_not_be_branched(env, why):
         search(start, env=env())
 
 
-@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1"])
-def test_an_environment_of_gymnasium_can_not_be_branched(name):
-    pytest.importorskip("gymnasium")
-    from torchrl.envs import GymEnv
-
-    with pytest.raises(ValueError, match="GymEnv can't be branched"):
-        check_branching(GymEnv(name))
-
-
 @pytest.mark.parametrize("kind", [Drawing, Walk, PendulumEnv])
 def test_random_numbers_are_no_memory(kind):
     """Nor does looking for it cost any."""

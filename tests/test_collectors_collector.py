@@ -49,24 +49,6 @@ def plain_collector(**kwargs) -> Collector:
     return Collector(make_env, Policy(), auto_register_policy_transforms=False, **settings)
 
 
-def test_one_branch_collects_what_a_plain_collector_does():
-    """Same entries, same values, same names, same counting."""
-    plain = plain_collector(reset_at_each_iter=True)
-    search = make(branches=1, prepare=None)
-    for collector in (plain, search):
-        collector.set_seed(3)
-    batches = 0
-    for one, other in zip(plain, search, strict=True):
-        assert other.names == one.names == [None, "time"]
-        assert other.shape == (ROWS, STEPS)
-        assert_same(other.exclude(*EXTRAS, ("collector", "traj_ids")), one.exclude(("collector", "traj_ids")))
-        batches += 1
-        for collector in (plain, search):
-            assert collector.stats()["frames"] == batches * FRAMES
-    assert batches == len(search) == 3
-    assert search.next() is None
-
-
 def test_best_leaf_and_its_search():
     (batch,) = collector = make(leaves=2, frames_per_batch=2 * FRAMES, total_frames=2 * FRAMES)
     assert batch.shape == (ROWS, 2, STEPS)

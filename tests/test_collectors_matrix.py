@@ -88,6 +88,8 @@ def assert_same_until_done(env: Callable[[], EnvBase], policy: Any, **kwargs: An
     for collector in (plain, ours):
         collector.set_seed(1)
     expected, found = plain.next().exclude("collector"), ours.next()
+    assert (expected.shape, expected.names) == (found.shape, found.names)
+    assert plain.stats()["frames"] == ours.stats()["frames"]
     mask = found["collector", "mask"]
     assert mask[..., 0].all()
     entries = set(found.exclude("collector").keys(True, True))

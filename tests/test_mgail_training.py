@@ -224,22 +224,6 @@ def test_the_duration_cuts_segments(seconds: Path, tmp_path: Path) -> None:
         assert short.experts(item).states.shape[1] == 6
 
 
-def test_an_agent_is_evaluated_for_the_duration_it_was_trained_with(seconds: Path, tmp_path: Path) -> None:
-    agent = load_agent(str(train(config("mgail", seconds, tmp_path / "run", duration=1, steps=1))))
-    assert agent.duration == 1
-    assert agent.spec is not None
-
-    def numbers(of: int, asked: int) -> Any:
-        other = replace(agent, spec=replace(agent.spec, duration=of))
-        return pytest.approx(
-            evaluate(other, seconds, replace(SETTINGS, duration=asked)).numbers(), nan_ok=True
-        )
-
-    assert numbers(1, 0) == numbers(0, 1).expected
-    assert numbers(2, 1) == numbers(1, 0).expected
-    assert numbers(2, 0) != numbers(1, 0).expected
-
-
 def test_eight_agents_train(tmp_path: Path) -> None:
     late = hide(crossing(10, seed=1, steps=9), 2, slice(5, 9))
     fill(tmp_path / "store", [straight_road(9, seed=0, steps=7), late])

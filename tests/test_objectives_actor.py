@@ -7,7 +7,6 @@ import warnings
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
 from torch import nn
 from torch.distributions import Categorical
 from torch.nn import functional
@@ -82,26 +81,6 @@ def test_distillation_is_one_bc_loss_per_kind(continuous, reduction):
         torch.testing.assert_close(out[name], bc(td, mask, actor=actor).detach())
     for name in () if continuous else ("accuracy", "entropy"):
         torch.testing.assert_close(out[name], bc(td, expert, name))
-
-
-def test_distillation_by_hand():
-    """An actor with fixed probabilities 1/2, 1/4, 1/8, 1/8."""
-    actor = ProbabilisticTensorDictSequential(
-        TensorDictModule(nn.Linear(1, 4), in_keys=["x"], out_keys=["logits"]),
-        ProbabilisticTensorDictModule(in_keys=["logits"], out_keys=["a"], distribution_class=Categorical),
-    )
-    with torch.no_grad():
-        actor[0].module.bias.copy_(torch.tensor([0.5, 0.25, 0.125, 0.125]).log())
-    td = TensorDict(x=torch.zeros(6, 1), a=torch.tensor([0, 1, 1, 3, 0, 0]), batch_size=[6])
-    td["rollout"] = torch.tensor([False, False, True, True, True, True])
-    td["valid"] = torch.tensor([True, True, True, True, True, False])
-    loss = DistillationLoss(actor)
-    loss.set_keys(action="a", valid="valid", rollout="rollout")
-    out, bits = loss(td), (2 + 3 + 1) / 3
-    expected = torch.tensor([1.5 + bits, 1.5, bits]) * torch.tensor(2.0).log()
-    got = torch.stack([out["loss_distillation"], out["nll_expert"], out["nll_rollout"]])
-    torch.testing.assert_close(got, expected)
-    assert out["accuracy"] == 0.5
 
 
 def test_distillation_without_reduction_keeps_the_shape():

@@ -80,23 +80,6 @@ def test_it_is_cross_entropy_over_the_feasible_goals(shape, reduction):
         torch.testing.assert_close(out["loss_goal"], values.sum() if reduction == "sum" else values.mean())
 
 
-def test_by_hand():
-    """Three agents: probabilities 1/2, 1/4, 1/4 over three of four goals; one goal; four goals of five."""
-    logits = torch.full((3, 5), 9.0)
-    logits[0, :4] = torch.tensor([0.25, 0.25, 9e9, 0.5]).log()
-    logits[2] = torch.tensor([0.4, 0.3, 0.2, 0.1, 9e9]).log()
-    mask = torch.tensor([[1, 1, 0, 1, 0], [0, 1, 0, 0, 0], [1, 1, 1, 1, 0]]).bool()
-    loss, td = fixed(logits)
-    td[MASK], td[LABEL] = mask, torch.tensor([3, 1, 3])
-    out = loss(td)
-    probability = torch.tensor([0.5, 1.0, 0.1])
-    torch.testing.assert_close(out["loss_goal"], -probability.log().mean())
-    torch.testing.assert_close(out["accuracy"], torch.tensor(2 / 3))
-    torch.testing.assert_close(out["accuracy_top3"], torch.tensor(2 / 3))
-    p, q = torch.tensor([0.5, 0.25, 0.25]), torch.tensor([0.4, 0.3, 0.2, 0.1])
-    torch.testing.assert_close(out["entropy"], -((p * p.log()).sum() + (q * q.log()).sum()) / 3)
-
-
 @pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
 def test_a_set_of_one_is_that_label(reduction):
     td = batch(30)

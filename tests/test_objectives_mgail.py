@@ -279,21 +279,6 @@ def test_copies_have_a_discriminator_of_their_own(env):
     assert len(list(loss.parameters())) == len(list(actor().parameters()))
 
 
-def test_keys_of_numbers_and_scores_can_be_set(env):
-    td = planned(env)
-    reference = make(env)(td)["loss_mgail"]
-    network = discriminator(*SIZES, hidden=8, head=(8,), out_key="s").double()
-    network.load_state_dict(realism().state_dict())
-    policy = displacement_policy(SELF_FEATURES, GROUPS, dt=0.2, hidden=8, head=(8,), noise_key="u").double()
-    policy.load_state_dict(actor().state_dict())
-    loss = MGAILLoss(policy, network, env)
-    with pytest.raises(KeyError, match="no score"):
-        loss(td)
-    loss.set_keys(score="s", noise="u", plan="numbers")
-    td.rename_key_(PLAN, "numbers")
-    assert torch.equal(loss(td)["loss_mgail"], reference)
-
-
 def test_bad_calls_are_refused(env):
     td = planned(env)
     with pytest.raises(KeyError, match="end of the episode"):
