@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from symphony._version import __version__ as __version__
 from symphony.imports import lazily
 
 if TYPE_CHECKING:
@@ -29,5 +28,6 @@ if TYPE_CHECKING:
     from symphony.recipes import train as train
     from symphony.rollouts.unroll import simulate as simulate
 
+__version__ = "0.1.0"
 __getattr__, __dir__ = lazily(__name__)
 __all__ = __dir__()  # noqa: PLE0605

@@ -18,8 +18,7 @@ from typing import Any, get_type_hints
 
 import tyro
 
-from symphony import allocator
-from symphony._version import __version__
+from symphony import __version__, allocator
 from symphony.cli.shared import Command, Result, warn
 from symphony.config.checks import Bounds
 from symphony.config.profiles import expanded
