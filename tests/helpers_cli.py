@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator
+from functools import cache
 from unittest import mock
 
 from tyro.extras import SubcommandApp
@@ -17,8 +18,16 @@ from symphony import cli
 
 def words() -> list[str]:
     """A line for each argument of each command, as its help shows it."""
+    return [" ".join([*command, word]) for command in commands() for word in _told(command)]
+
+
+@cache
+def help_of(*command: str) -> str:
+    """The help of a command."""
     with mock.patch.dict(os.environ, {"COLUMNS": "110"}):  # no wider, or boxes stand beside one another
-        return [" ".join([*command, word]) for command in commands() for word in _told(command)]
+        with contextlib.redirect_stdout(io.StringIO()) as shown:
+            assert cli.main([*command, "--help"]) == 0
+        return shown.getvalue()
 
 
 def commands(app: SubcommandApp = cli.app, *before: str) -> list[tuple[str, ...]]:
@@ -31,10 +40,8 @@ def commands(app: SubcommandApp = cli.app, *before: str) -> list[tuple[str, ...]
 
 
 def _told(command: tuple[str, ...]) -> Iterator[str]:
-    with contextlib.redirect_stdout(io.StringIO()) as shown:
-        cli.main([*command, "--help"])
     title = ""
-    for line in shown.getvalue().splitlines():
+    for line in help_of(*command).splitlines():
         if re.match(r" \w", line):
             title = line.split()[0]
         elif found := re.match(

@@ -46,12 +46,10 @@ def fits(value: Any, hint: Any) -> bool:
     if origin is tuple and isinstance(value, tuple):
         parts = parts[:1] * len(value) if len(parts) == 2 and parts[1] is ... else parts
         return len(value) == len(parts) and all(map(fits, value, parts))
-    if inspect.isclass(origin) and isinstance(value, origin):
-        if issubclass(origin, Mapping):
-            return all(fits(item, parts[1]) for item in value.values())
-        if issubclass(origin, list):
-            return all(fits(item, parts[0]) for item in value)
-    return True
+    if not (inspect.isclass(origin) and isinstance(value, origin)):
+        return True
+    items = value.values() if issubclass(origin, Mapping) else value if issubclass(origin, list) else ()
+    return all(fits(item, parts[-1]) for item in items)
 
 
 def _is(value: Any, hint: Any) -> bool:

@@ -51,14 +51,6 @@ def test_a_perfect_policy_is_corrected_to_zero(segments: int, rollouts: int) -> 
     assert found[:, 2].std() < 2 * error
 
 
-def test_more_data_lower_the_bias_and_alike_rollouts_do_not() -> None:
-    few, many = means(100, 16)[:, 1].mean(), means(400, 16)[:, 1].mean()
-    assert many == pytest.approx(few / 4, rel=0.3)
-    assert means(100, 4)[:, 1].mean() > few
-    # Sixteen rollouts that are copies of four are four.
-    assert means(100, 16, copies=4)[:, 1].mean() == pytest.approx(means(100, 4)[:, 1].mean(), rel=0.15)
-
-
 def test_what_differs_is_left_when_the_bias_is_taken_away() -> None:
     rng = np.random.default_rng(0)
     p, q = rng.dirichlet(np.ones(BINS), 2)
@@ -71,13 +63,6 @@ def test_what_differs_is_left_when_the_bias_is_taken_away() -> None:
     assert np.mean([d.error for d in found]) == pytest.approx(corrected.std(), rel=0.3)
 
 
-def test_a_single_sample_has_no_error() -> None:
-    found = sampled_divergence(np.array([[1, 2]]), np.array([[0, 1]]))
-    assert found.value > 0
-    assert math.isnan(found.corrected)
-    assert math.isnan(found.error)
-
-
 def test_of_two_samples_the_error_is_half_the_difference_of_what_each_says() -> None:
     counts, log = np.array([[3, 1], [1, 5]]), np.array([[1, 0], [1, 1]])
     found = sampled_divergence(counts, log)
@@ -86,6 +71,10 @@ def test_of_two_samples_the_error_is_half_the_difference_of_what_each_says() -> 
     assert found.value == pytest.approx(whole)
     assert found.corrected == pytest.approx(sum(each) / 2)
     assert found.error == pytest.approx(abs(each[0] - each[1]) / 2)
+    alone = sampled_divergence(counts[:1], log[:1])
+    assert alone.value > 0
+    assert math.isnan(alone.corrected)
+    assert math.isnan(alone.error)
 
 
 @pytest.mark.parametrize("segments", [50, 200])
@@ -165,8 +154,4 @@ def test_a_search_that_keeps_all_moves_no_goal(order: list[int], seed: int) -> N
     drawn = torch.tensor(rng.integers(0, 4, (1, 6, 2)))
     turn = torch.tensor(rng.integers(0, 3, (1, 2, 4)))
     (one,) = choices(drawn, drawn[:, list(order)], turn, torch.tensor([6.0]))
-    assert one.variation == 0
-    assert one.drawn.tolist() == one.kept.tolist()
-    # One route for all moves the most, and by no more than 1.
-    (moved,) = choices(drawn, drawn[:, :1].expand(-1, 6, -1), turn, torch.tensor([1.0]))
-    assert 0 <= moved.variation < 1
+    assert (one.variation, one.drawn.tolist()) == (0, one.kept.tolist())

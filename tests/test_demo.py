@@ -11,11 +11,10 @@ import pytest
 
 from helpers_segments import crossing, straight_road
 from symphony.cli import main
-from symphony.config import Method, TrainConfig
+from symphony.config import Method
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
-from symphony.errors import ConfigError
 
 
 def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -54,22 +53,6 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert "your BC+H" not in first
     assert "your BC+H" in second
     assert len(told.splitlines()) <= 30  # a screen
-
-
-def test_the_included_agent_is_shown_before_anything_is_learned(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with StoreWriter(tmp_path / "test") as writer:
-        writer.append(SegmentStore(builtin_store("test"))[0])
-    monkeypatch.setattr("symphony.data.builtin.builtin_store", lambda _: tmp_path / "test")
-
-    def stop(config: TrainConfig) -> None:
-        raise ConfigError("here it would learn")
-
-    monkeypatch.setattr("symphony.recipes.train", stop)
-    assert main(["demo", "--out", str(tmp_path / "demo"), "--rollouts", "1"]) == 1
-    assert (tmp_path / "demo" / "included.png").stat().st_size > 10_000
-    assert len(json.loads((tmp_path / "demo" / "metrics.json").read_text())["rows"]) == 3
 
 
 def test_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -89,12 +89,6 @@ def test_commands_are_understood(
             )
 
 
-def test_a_wrong_flag_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(symphony.cli, "guarded", lambda run: 0)
-    assert symphony.cli.main(["data", "info", "DIR"]) == 0
-    assert symphony.cli.main(["data", "info", "DIR", "--no-such-flag"]) == 2
-
-
 def test_other_commands_exist() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
     for page in PAGES:
@@ -133,13 +127,6 @@ def test_records_are_few_and_say_how_they_were_made(tables: dict[str, Any]) -> N
     assert tables["cell"]("–") == "–"
 
 
-def test_a_changed_figure_is_found(tables: dict[str, Any]) -> None:
-    text = (ROOT / "docs" / "results.md").read_text()
-    figure = re.search(r"\| BC \| (\d+\.\d) ", text)
-    assert figure is not None
-    assert tables["rewritten"](text.replace(figure[0], "| BC | 0.1 ")) == text
-
-
 def anchors(page: Path) -> set[str]:
     """Of a page's headings, as they are made for it."""
     headings = re.findall(r"(?m)^#+ (.+)$", page.read_text())
@@ -169,17 +156,9 @@ OTHERS = re.compile(r"(?<![\w-])symphony\[[a-z]|pip install (?:[^\n`|#]*[\s'\"])
 
 
 def test_nothing_tells_to_install_another_project() -> None:
-    name = "symphony"
-    for wrong in (f"{name}[sumo]", f"pip install -U {name}", f"pip install '{name}'"):
-        assert OTHERS.search(wrong)
-    files = [
-        file
-        for folder in ("", "docs", "src", "tests", "recipes", "examples", "benchmarks")
-        for pattern in ("*.md", "*.py", "*.toml")
-        for file in (ROOT.glob(pattern) if not folder else (ROOT / folder).rglob(pattern))
-    ]
-    assert len(files) > 200
-    for file in files:
+    folders = [ROOT / name for name in ("docs", "src", "tests", "recipes", "examples", "benchmarks")]
+    files = [*ROOT.glob("*"), *(file for folder in folders for file in folder.rglob("*"))]
+    for file in (file for file in files if file.suffix in {".md", ".py", ".toml"}):
         found = OTHERS.search(file.read_text(encoding="utf-8"))
         assert found is None, f"{file.relative_to(ROOT)}: {found and found[0]}"
 

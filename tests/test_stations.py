@@ -18,12 +18,11 @@ Reals = NDArray[np.float64]
 
 
 def bend(turns: float, radius: float = 20.0, length: float = 189.0) -> Reals:
-    """A line that turns evenly, in points 3 m apart: so many times around a circle of the given radius, if at all."""
+    """A straight line, or one that goes around a circle of the given radius, in points 3 m apart."""
     arc = np.arange(0.0, length + 1e-9, 3.0)
-    angle = arc / radius if turns else np.zeros_like(arc)
     if not turns:
         return np.stack([arc, np.zeros_like(arc)], -1)
-    return radius * np.stack([np.sin(angle), 1.0 - np.cos(angle)], -1)
+    return radius * np.stack([np.sin(arc / radius), 1.0 - np.cos(arc / radius)], -1)
 
 
 def at(line: Reals, along: Reals) -> Reals:
@@ -84,16 +83,6 @@ def test_turning_the_world_padding_and_company_change_nothing(turn: float) -> No
     np.testing.assert_allclose(stations_along(padded[None], path[None], valid), alone, atol=1e-12)
     both = stations_along(np.stack([line, straight]), np.stack([path, other]), valid.repeat(2, 0))
     np.testing.assert_array_equal(both[:1], alone)
-
-
-def test_how_much_is_found_together_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(0)
-    lines, path = rng.normal(0.0, 2.0, (3, 40, 2)).cumsum(1), rng.normal(0.0, 2.0, (3, 21, 2)).cumsum(1)
-    valid = rng.random((3, 21)) < 0.8
-    whole = stations_along(lines, path, valid)
-    for distances in (1, 4 * 3 * 39):
-        monkeypatch.setattr("symphony.geometry.polylines._TOGETHER", distances)
-        np.testing.assert_array_equal(stations_along(lines, path, valid), whole)
 
 
 def test_a_point_that_is_not_finite_is_refused_by_its_place() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
@@ -36,21 +36,13 @@ def frames(clips: list[Clip], path: Path, **options: Any) -> np.ndarray:
     """[F, H, W, 3]."""
     animate_rollouts(clips, path, size=SIZE, **options)
     with Image.open(path) as image:
-        found = []
-        for k in range(getattr(image, "n_frames", 1)):
-            image.seek(k)
-            found.append(np.asarray(image.convert("RGB")))
-    return np.stack(found)
+        return np.stack([np.asarray(page.convert("RGB")) for page in ImageSequence.Iterator(image)])
 
 
 def durations(path: Path) -> list[float]:
     """Seconds of each frame."""
     with Image.open(path) as image:
-        found = []
-        for k in range(getattr(image, "n_frames", 1)):
-            image.seek(k)
-            found.append(image.info["duration"] / 1000)
-    return found
+        return [page.info["duration"] / 1000 for page in ImageSequence.Iterator(image)]
 
 
 def standing(segment: RunSegment, agents: list[int]) -> RunSegment:
@@ -72,12 +64,8 @@ def test_frames_are_the_steps_or_evenly_fewer_in_real_time(
     assert len(drawn) == -(-shown // every) <= MOST
     assert durations(file) == pytest.approx([every * segment.dt] * len(drawn))
     assert file.stat().st_size < 1_000_000
-
-
-def test_steps_of_no_whole_hundredths_are_in_real_time_too(tmp_path: Path) -> None:
-    file = tmp_path / "a.gif"
-    frames([clip(crossing(3, steps=11).replace(dt=1 / 30), [0], start=0)], file)
-    assert sum(durations(file)) == pytest.approx(11 / 30, abs=0.006)
+    frames([clip(segment.replace(dt=1 / 30), [0], start=start)], file)  # no whole hundredths
+    assert sum(durations(file)) == pytest.approx(len(drawn) * every / 30, abs=0.006)
 
 
 def test_nothing_changes_but_where_something_moves(tmp_path: Path) -> None:
@@ -92,24 +80,6 @@ def test_nothing_changes_but_where_something_moves(tmp_path: Path) -> None:
     # The clock is at the right.
     columns = np.flatnonzero((drawn[:, clock] != drawn[:1, clock]).any((0, 1, 3)))
     assert columns.min() > 0.7 * drawn.shape[2]
-
-
-def test_legend_and_scale_are_never_hidden(tmp_path: Path) -> None:
-    """Boxes as large as the picture cover all the rest of it."""
-    segment = straight_road(2, steps=4)
-    huge = segment.replace(size=np.full_like(segment.size, 400.0))
-    view = (0.0, 50.0, -25.0, 25.0)
-    plain, covered = (
-        frames([clip(shown, [0, 1], view=view)], tmp_path / "a.gif")[-1].astype(int)
-        for shown in (segment, huge)
-    )
-    height, width = plain.shape[:2]
-    same = (abs(plain - covered) < 40).all(-1)
-    scale = np.s_[int(0.85 * height) : int(0.92 * height), int(0.05 * width) : int(0.25 * width)]
-    legend = np.s_[int(0.19 * height) : int(0.37 * height), int(0.47 * width) : int(0.94 * width)]
-    assert same[scale].all()
-    assert same[legend].all()
-    assert same[int(0.5 * height) : int(0.8 * height), int(0.1 * width) : int(0.9 * width)].mean() < 0.1
 
 
 @pytest.mark.parametrize("padded", [[0, -1, 2], [-1, 0, 2, -1]])

@@ -35,6 +35,7 @@ from symphony.files import lock_file
 __all__ = ["main"]
 
 FAILED, USAGE, ALL_FAILED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 143
+"""Statuses that commands end with, beside 0."""
 
 GONE = {
     "evaluate --wosac-config": "`symphony wosac evaluate` takes the year as --config",
@@ -70,14 +71,7 @@ for _name in COMMANDS.split():
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        args: the arguments, by default those of the process.
-
-    Returns:
-        Exit status: 0 done, 1 failed, 2 wrong usage, 3 every simulated run failed, 130 interrupted, 143 terminated.
-    """
+    """Run the command line, by default with the arguments of the process, and return the exit status."""
     if args is None:
         settle()
         args = sys.argv[1:]
@@ -87,7 +81,7 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         for gone, instead in GONE.items():
             *command, last = gone.split()
-            if args[: len(command)] == command and last in args[len(command) :]:
+            if args[: len(command)] == command and last in args:
                 raise ConfigError(f"`symphony {gone}` is gone: {instead}")
         chosen = app.cli(
             prog="symphony",
@@ -96,8 +90,8 @@ def main(args: Sequence[str] | None = None) -> int:
             config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
         )
         for name, value, bounds in _marked(chosen, Bounds):
-            if (len(value) if isinstance(value, tuple) else value) < bounds.least:
-                raise ConfigError(f"{name}: give at least {bounds.least}")
+            if not bounds.least <= (len(value) if isinstance(value, tuple) else value) <= bounds.most:
+                raise ConfigError(f"{name}: give at least {bounds.least:g} and at most {bounds.most:g}")
     except ConfigError as error:
         return _complain(error, USAGE)
     except SystemExit as stop:
@@ -125,8 +119,7 @@ def _marked(command: Any, mark: type) -> Iterator[tuple[str, Any, Any]]:
 def settle() -> None:
     """Settings of a process that is ours alone, before it loads torch; those of the user take precedence."""
     allocator.tune()
-    # Threads of OpenMP that spin while they wait take the cores of a busy machine.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin take the cores of a busy machine
 
 
 def guarded(action: Callable[[], object]) -> int:

@@ -253,9 +253,8 @@ class Info(shared.Command):
             found["interactive"] = choices(store, self.interactive)
         if shared.write_numbers(self.json, found):
             found.get("interactive", {}).pop("segments", None)
-            shared.print_facts(
-                {name: value for name, value in found.items() if name not in LISTS}, found["path"]
-            )
+            facts = {name: value for name, value in found.items() if name not in LISTS}
+            shared.print_facts(facts, found["path"])
 
 
 class Verify(shared.Command):

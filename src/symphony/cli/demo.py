@@ -44,10 +44,8 @@ class Demo(shared.Command):
         from symphony.render import draw_clips
 
         began, run, numbers = time.perf_counter(), self.out / "bc_h", self.out / "metrics.json"
-        test, settings = (
-            symphony.builtin_store("test"),
-            EvaluateConfig(rollouts=self.rollouts, seed=self.seed),
-        )
+        test = symphony.builtin_store("test")
+        settings = EvaluateConfig(rollouts=self.rollouts, seed=self.seed)
         items = evenly_spaced(len(symphony.SegmentStore(test)), PANELS)
         rows: list[dict[str, Any]] = []
         clips: list[Clip] = []
@@ -74,13 +72,10 @@ class Demo(shared.Command):
         # displaced states once the policy drives.
         agent = AgentConfig(num_points=128, num_lights=4, features="gaps", accelerations=21)
         perturb = PerturbConfig(share=0.5, begin=self.steps // 3)
-        sizes: dict[str, Any] = {"steps": self.steps, "states": 512, "agent": agent, "perturb": perturb}
-        learn = symphony.builtin_store("train")
-        symphony.train(
-            TrainConfig(method="bc_h", data=learn, out=run, seed=self.seed, wandb="disabled", **sizes)
-        )
+        more: dict[str, Any] = {"states": 512, "agent": agent, "perturb": perturb, "wandb": "disabled"}
+        more |= {"data": symphony.builtin_store("train"), "out": run, "steps": self.steps, "seed": self.seed}
+        symphony.train(TrainConfig(method="bc_h", **more))
         show({"your BC+H": str(run)}, self.out / "rollouts.png")
-        shared.say(f"numbers: {numbers}\nagent:   {run}")
         shared.say(
-            "next:    symphony test examples/suite.toml holds a planner among such agents to thresholds"
+            f"numbers: {numbers}\nagent:   {run}\nnext:    symphony test examples/suite.toml tests a planner"
         )

@@ -43,14 +43,12 @@ class Evaluate(shared.Simulation):
     metrics: tuple[Literal["wosac"], ...] = ()
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if self.planner and (self.figure is not None or self.metrics or self.config.metric):
             raise ConfigError("--figure, --metrics and --metric go without --planner: they are of the agent")
 
     def __call__(self) -> None:
         if self.planner:
-            self._evaluate_planner()
-            return
+            return self._evaluate_planner()
         from symphony.evaluation.records import evaluation_record, keep_evaluation
 
         if self.figure is not None:
@@ -68,10 +66,8 @@ class Evaluate(shared.Simulation):
         keepers = self._keepers(agent, store, len(chosen or store))
         observe: Any = (lambda *found: [keeper(*found) for keeper in keepers.values()]) if keepers else None
         with shared.progress(f"evaluating {agent.name}") as advance:
-            items = chosen or None
-            found = symphony.evaluate(
-                agent, store, config, advance, items=items, baselines=True, observe=observe
-            )
+            more: dict[str, Any] = {"items": chosen or None, "observe": observe}
+            found = symphony.evaluate(agent, store, config, advance, baselines=True, **more)
         record = evaluation_record(agent, found, store)
         if self.metrics:
             rows = chosen or range(len(store))
@@ -79,7 +75,8 @@ class Evaluate(shared.Simulation):
                 scored = evaluate_wosac(agent, store, rows, WosacSettings.of(config), progress=advance)
             record |= wosac_parts(scored, record)
         if shared.write_numbers(self.json, record):
-            shared.print_evaluation(found, self.data, details=self.details)
+            others = [one.numbers() for one in found.baselines if one.agent != found.agent]
+            shared.print_metrics([*others, found.numbers()], str(self.data), details=self.details)
             if self.metrics:
                 from symphony.wosac.table import wosac_table
 

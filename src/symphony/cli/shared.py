@@ -14,14 +14,13 @@ from tyro.conf import Positional, arg
 
 import symphony
 from symphony.config import EvaluateConfig
-from symphony.config.checks import Bounds, Count
-from symphony.config.evaluation import Engine, check_planner_seconds
+from symphony.config.checks import Bounds, Count, Positive
+from symphony.config.evaluation import MOST_SECONDS, Engine
 from symphony.errors import AllFailedError, ConfigError, printable
-from symphony.files import json_text, write_json
+from symphony.files import json_text, write_file, write_json
 
 if TYPE_CHECKING:
     from symphony.data.store import SegmentStore
-    from symphony.evaluation import Evaluation
     from symphony.saved.folder import RolloutFolder
 
 
@@ -47,10 +46,7 @@ EngineName = Annotated[Engine, arg(help=_ENGINE)]
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
 class Command:
-    """A command: its subclasses are frozen dataclasses of arguments, and a call does the work.
-
-    Comments at the fields, or above them after `#:`, are their help.
-    """
+    """A command: a frozen dataclass of arguments, whose comments are their help; a call does the work."""
 
     def __init_subclass__(cls) -> None:
         dataclass(frozen=True, kw_only=True)(cls)
@@ -70,12 +66,10 @@ class Simulation(Command):
     #: as the agent all others play back the log. Nothing is searched then, unless --search, --branches or --trees say
     #: so: a search asks the planner once for each branch.
     planner: str = ""
-    planner_seconds: float = 60.0  # Seconds that a planner has for one answer; a longer one fails the run.
+    #: Seconds that a planner has for one answer; a longer one fails the run.
+    planner_seconds: Annotated[Positive, Bounds(most=MOST_SECONDS)] = 60.0
     trust_code: TrustCode = False
     config: Annotated[EvaluateConfig, arg(name="")] = field(default_factory=EvaluateConfig)
-
-    def __post_init__(self) -> None:
-        check_planner_seconds(self.planner_seconds)
 
     def simulated(
         self, out: Path, runs: int = 0, goals: tuple[str, ...] = (), tree: bool = True
@@ -113,12 +107,7 @@ def tell_failed(folder: RolloutFolder) -> None:
 
 
 def segment_indices(store: SegmentStore, names: Sequence[str]) -> list[int]:
-    """The places in a store of some run segments, each named once, by its id or its number.
-
-    Raises:
-        ConfigError: one is named twice.
-        DataError: there is no such segment.
-    """
+    """The places in a store of some run segments, each named once by its id or its number, or ConfigError."""
     found: dict[int, str] = {}
     for name in names:
         place = store.index_of(int(name) if name not in store.ids and name.isdecimal() else name)
@@ -130,10 +119,7 @@ def segment_indices(store: SegmentStore, names: Sequence[str]) -> list[int]:
 
 @contextmanager
 def progress(description: str, unit: str = "segments") -> Iterator[Callable[..., None]]:
-    """A progress bar on standard error, as long as the work takes.
-
-    Gives a function of how much is done, the total, and (if there is more to tell) a note.
-    """
+    """A progress bar on standard error; gives a function of how much is done, the total, and maybe a note."""
     from rich.console import Console
     from rich.markup import escape
     from rich.progress import Progress, TextColumn
@@ -164,11 +150,7 @@ def warn(text: str) -> None:
 
 
 def write_numbers(path: Path | None, numbers: Any) -> bool:
-    """Write numbers as JSON to a file, to standard output where the file is called -, or nowhere.
-
-    Returns:
-        Whether a text is to be printed, too.
-    """
+    """Write numbers as JSON to a file, or to standard output where it is called -; otherwise True: print a text."""
     if str(path) == "-":
         sys.stdout.write(json_text(numbers))
     elif path is not None:
@@ -178,8 +160,6 @@ def write_numbers(path: Path | None, numbers: Any) -> bool:
 
 def write_text(path: Path | None, text: str) -> None:
     """Write a text to a file, or to standard output where none is given."""
-    from symphony.files import write_file
-
     if path is None:
         sys.stdout.write(text)
     else:
@@ -232,30 +212,15 @@ COLUMNS = (
 """Numbers in the table of agents, with the two lines of their headings, and digits."""
 
 
-def metrics_rows(rows: Sequence[Mapping[str, Any]], first: str = "agent") -> list[list[str]]:
-    """The table of some agents' records, with two rows of headings.
-
-    Args:
-        rows: numbers of each agent, and its name as ``agent``.
-        first: heading of the first column.
-    """
-    table = [[heading.split("\n")[k] for heading in (f"{first}\n", *(c[1] for c in COLUMNS))] for k in (0, 1)]
-    for row in rows:
+def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, details: bool = False) -> None:
+    """Print records of agents as one table and a line of what they are of; with details, all of their numbers."""
+    heads = [("agent\n", *(heading for _, heading, _ in COLUMNS))] * 2
+    table = [[heading.split("\n")[k] for heading in head] for k, head in enumerate(heads)]
+    named = [{**row, "agent": short_name(str(row["agent"]))} for row in rows]
+    for row in named:
         numbers = ((row[n], row.get(f"{n}_se"), digits, row.get(f"{n}_bound")) for n, _, digits in COLUMNS)
         table.append([row["agent"], *(number_cell(*number) for number in numbers)])
-    return table
-
-
-def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, details: bool = False) -> None:
-    """Print results of agents as one table and a line of what they are of.
-
-    Args:
-        rows: a record for each agent.
-        title: of the table.
-        details: also print every number of each agent.
-    """
-    named = [{**row, "agent": short_name(str(row["agent"]))} for row in rows]
-    print_table(metrics_rows(named), title, heads=2)
+    print_table(table, title, heads=2)
     for row in named:
         for name in (name for name in row if ":" in name and not name.endswith("_se")):  # the user's own
             say(f"{row['agent']}: {name} {number_cell(row[name], row.get(f'{name}_se'), 4)}")
@@ -269,12 +234,6 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, details: b
         f"{first['segments']} run segments of {first['groups']} recordings, {driven} each, up to {most} rollouts; "
         f"± standard error over recordings, ≤ exact bound of a zero (95 %); seed {first['seed']}"
     )
-
-
-def print_evaluation(found: Evaluation, data: Path, *, details: bool = False) -> None:
-    """Print the baselines and the agent of an evaluation as :func:`print_metrics` does."""
-    others = [baseline.numbers() for baseline in found.baselines if baseline.agent != found.agent]
-    print_metrics([*others, found.numbers()], str(data), details=details)
 
 
 def short_name(agent: str) -> str:

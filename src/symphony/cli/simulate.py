@@ -33,7 +33,6 @@ class Simulate(shared.Simulation):
     tree: bool = True  # Leave out the branches that a search pruned.
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if self.runs < 0 or (self.runs and self.segments):
             raise ConfigError("--runs is a number of runs, and goes without --segments")
         if self.runs and self.config.rollouts != EvaluateConfig.rollouts:

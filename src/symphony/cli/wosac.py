@@ -34,8 +34,7 @@ Strict = Annotated[bool, arg(help=_STRICT)]
 class Score(shared.Command):
     """Score rollouts, made by anything, against logged scenarios of the Waymo Open Motion Dataset.
 
-    The numbers are those of the official scorer. See docs/wosac.md for what they mean, and for the legal notice that
-    goes with the metric.
+    The numbers are those of the official scorer; docs/wosac.md says what they mean, and has the legal notice.
     """
 
     scenario: Scenarios
@@ -96,10 +95,7 @@ class Evaluate(shared.Command):
 
 
 class Table(shared.Command):
-    """Put the scores of several agents on the same run segments into one table (Markdown).
-
-    One line for the agent of each record, after the baselines.
-    """
+    """Put the scores of several agents on the same run segments into one table (Markdown), after the baselines."""
 
     #: Files that `symphony wosac evaluate --json FILE` wrote.
     records: Annotated[Positional[shared.Paths], arg(metavar="FILE ...")]
@@ -116,9 +112,8 @@ class Table(shared.Command):
 class Submit(shared.Command):
     """Simulate 32 rollouts of every scenario of the Waymo Open Motion Dataset and write them as a submission.
 
-    The agent drives all vehicles but those that stand with no green light ahead, which stay; pedestrians and cyclists
-    keep about their velocity. What happens after the current step of a scenario is not looked at, so the test set
-    will do. See docs/wosac.md.
+    Who drives what is as in `symphony wosac evaluate`. What happens after the current step of a scenario is not
+    looked at, so the test set will do. See docs/wosac.md.
     """
 
     agent: Agent
@@ -155,8 +150,7 @@ class Submit(shared.Command):
 class Validate(shared.Command):
     """Check a submission offline for what the challenge's server would refuse.
 
-    Archive, shards, metadata, number of rollouts and steps, numbers; with --scenario also that it holds exactly the
-    scenarios and agents that have to be simulated.
+    With --scenario, also that it holds exactly the scenarios and agents that have to be simulated.
     """
 
     submission: Annotated[Positional[Path], arg(metavar="FILE")]  # File of the submission (.tar.gz).
