@@ -132,7 +132,6 @@ def test_the_command_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["plot", "curves", one, two, "--out", out, "--metrics", "auc", "accuracy"]) == 0
     assert Path(out).stat().st_size > 5_000
     for words, expected in (
-        (["nowhere"], "is no run"),
         ([str(fresh)], "no metrics to draw"),
         ([one, "--metrics", "auk"], "no run has auk"),
         ([one, "--window", "2"], "from 0 to 1"),

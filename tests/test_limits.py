@@ -99,7 +99,7 @@ def test_argoverse_rows_and_texts_beyond_all_measure(tmp_path: Path) -> None:
     columns = helpers.scenario()
     columns["track_id"] = [[name] for name in columns["track_id"]]
     error = read_error("argoverse2", helpers.write(tmp_path, columns))
-    assert (error.field, error.message) == ("track_id", "expected text, is list<element: string>")
+    assert (error.field, error.message) == ("track_id", "expected string, is list<element: string>")
 
 
 class Fragile(FakeReader):

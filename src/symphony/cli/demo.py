@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import symphony
 from symphony.cli import shared
 from symphony.config import AgentConfig, EvaluateConfig, PerturbConfig, TrainConfig
-from symphony.files import Lock, write_json
+from symphony.files import write_json
 
 if TYPE_CHECKING:
     from symphony.render import Clip
@@ -34,8 +34,7 @@ class Demo(shared.Command):
     seed: int = 0  # Seed of the training and of the rollouts.
 
     def __call__(self) -> None:
-        self.out.mkdir(parents=True, exist_ok=True)
-        with Lock(self.out / "demo.lock"):
+        with shared.locked_folder(self.out, "demo.lock"):
             self._show_all()
 
     def _show_all(self) -> None:

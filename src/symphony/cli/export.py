@@ -10,7 +10,7 @@ from tyro.conf import arg
 
 from symphony.cli import shared
 from symphony.errors import ConfigError
-from symphony.files import Lock, naming, write_file
+from symphony.files import write_file
 
 
 class Export(shared.Command):
@@ -31,9 +31,7 @@ class Export(shared.Command):
 
         folder, count, suffix = load_rollouts(self.folder), 0, "json" if self.format == "json" else "xml"
         out = self.folder / "export" if self.out is None else self.out
-        with naming(out):
-            out.mkdir(parents=True, exist_ok=True)
-        with Lock(out / "export.lock"):
+        with shared.locked_folder(out, "export.lock"):
             for name in self.segments or folder.ids:
                 saved = folder.of(name)
                 for k in self.rollouts or range(saved.rollouts):

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 import symphony
 from symphony.cli import shared
 from symphony.config.checks import Count
-from symphony.errors import ConfigError, DataError
+from symphony.errors import ConfigError
 
 Runs = Annotated[Positional[shared.Paths], arg(metavar="RUN ...", help="Folders of runs.")]
 
@@ -38,17 +38,13 @@ class Curvature(shared.Command):
         from symphony.render import plot_curvature
 
         panels = {}
-        for run, folder in zip(self.runs, map(run_folder, self.runs), strict=True):
-            if not (folder / "config.json").is_file():
-                raise ConfigError(f"{folder} is no run: it has no config.json")
+        for run in self.runs:
+            folder = run_folder(run)
+            method = method_name(read_run(folder)["method"])
             held = choose_evaluation(folder, kept_evaluations(folder), self.evaluation)[1]["curvature"]
-            try:
-                policy, log = (np.array(held[part], dtype=np.int64) for part in ("policy", "log"))
-                divergence = 1000 * float(jensen_shannon(policy, log))
-            except (ValueError, TypeError) as error:
-                raise DataError(f"no histogram ({error})", file=folder, field="curvature") from error
-            title = f"{method_name(read_run(folder)['method'])} ({run}): JSD {divergence:.2f} · 10⁻³"
-            panels[title] = policy, log
+            policy, log = (np.array(held[part], dtype=np.int64) for part in ("policy", "log"))
+            divergence = 1000 * float(jensen_shannon(policy, log))
+            panels[f"{method} ({run}): JSD {divergence:.2f} · 10⁻³"] = policy, log
         plot_curvature(panels, self.out)
 
 
@@ -66,8 +62,6 @@ class Curves(shared.Command):
         from symphony.render import plot_curves
         from symphony.training.logging import read_metrics
 
-        if missing := [folder for folder in self.runs if not (folder / "metrics.jsonl").is_file()]:
-            raise ConfigError(f"{missing[0]} is no run: it has no metrics.jsonl")
         found = {str(folder): read_metrics(folder) for folder in self.runs}
         plot_curves(found, self.out, metrics=self.metrics, window=self.window)
 

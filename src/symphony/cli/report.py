@@ -9,7 +9,7 @@ from tyro.conf import arg
 
 from symphony.cli import shared
 from symphony.errors import AllFailedError
-from symphony.files import Lock, naming, write_file, write_json
+from symphony.files import write_file, write_json
 
 
 class Report(shared.Command):
@@ -32,9 +32,7 @@ class Report(shared.Command):
         from symphony.saved.folder import load_rollouts
 
         folder, out = load_rollouts(self.folder), self.folder if self.out is None else self.out
-        with naming(out):
-            out.mkdir(parents=True, exist_ok=True)
-        with Lock(out / "report.lock"):
+        with shared.locked_folder(out, "report.lock"):
             with shared.progress("evaluating") as advance:
                 found = report(folder, self.evaluated, advance)
             plain, totals = found.plain(), found.totals()

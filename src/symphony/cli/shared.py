@@ -17,7 +17,7 @@ from symphony.config import EvaluateConfig
 from symphony.config.checks import Bounds, Count, Positive
 from symphony.config.evaluation import MOST_SECONDS, Engine
 from symphony.errors import AllFailedError, ConfigError, printable
-from symphony.files import json_text, write_file, write_json
+from symphony.files import Lock, json_text, naming, write_file, write_json
 
 if TYPE_CHECKING:
     from symphony.data.store import SegmentStore
@@ -115,6 +115,15 @@ def segment_indices(store: SegmentStore, names: Sequence[str]) -> list[int]:
             raise ConfigError(f"segment {store.ids[place]} is named twice: {found[place]}, {name}")
         found[place] = name
     return list(found)
+
+
+@contextmanager
+def locked_folder(path: Path, name: str) -> Iterator[None]:
+    """Make a folder, and keep other writers out of it by a file of that name."""
+    with naming(path):
+        path.mkdir(parents=True, exist_ok=True)
+    with Lock(path / name):
+        yield
 
 
 @contextmanager
