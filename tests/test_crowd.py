@@ -275,25 +275,17 @@ def test_who_is_driven_is_a_matter_of_choice() -> None:
 
 @pytest.mark.parametrize("others", ["constant_velocity", "idm", "learned"])
 def test_others_are_driven_but_not_evaluated(store: SegmentStore, others: Any, tmp_path: Path) -> None:
+    """The log against itself is at no distance, whoever drives the rest, and goals are those of the evaluated."""
     config = EvaluateConfig(rollouts=2, search="none", interactive=2, others=others)
-    found = evaluate(tiny(), store, config)
-    assert sorted(found.metrics.segments) == sorted(store.ids)
-    saved = next(iter(save_simulation(tmp_path, tiny(), crowd_dataset(store, tiny(), config, [2]), config)))
+    assert evaluate("playback", builtin_store("test"), config, items=[0, 1]).numbers()["curvature_jsd"] == 0
+    saved = save_simulation(tmp_path, tiny(), crowd_dataset(store, tiny(), config, [2]), config)[0]
     assert len(saved.agents) > 2
     assert saved.evaluated.tolist() == [0, 1]
     assert set(saved.drivers[2:]) == {f"background:{others}"}
-
-
-def test_the_others_count_neither_in_the_log_nor_among_goals(store: SegmentStore) -> None:
-    """The log against itself is at no distance, whoever drives the rest, and goals are those of the evaluated."""
-    config = EvaluateConfig(rollouts=1, interactive=2, others="idm")
-    log = evaluate("playback", builtin_store("test"), config, items=range(4)).numbers()
-    assert log["curvature_jsd"] == 0
-    config = replace(config, rollouts=4, search="tree", others="learned")
-    found = evaluate(tiny(), store, config).metrics.segments
+    found = evaluate(tiny(), store, replace(config, rollouts=4, search="tree")).metrics.segments
+    assert sorted(found) == sorted(store.ids)
     drawn = [int(segment.choice.drawn.sum()) for segment in found.values()]
-    assert max(drawn) > 0
-    assert all(count <= 2 * config.rollouts for count in drawn)
+    assert 0 < max(drawn) <= 2 * 4
 
 
 @pytest.mark.parametrize("settings", [{"interactive": "all"}, {"interactive": 2, "others": "idm"}])
@@ -387,9 +379,8 @@ def test_a_cold_draw_is_the_likeliest_action() -> None:
         config = EvaluateConfig(rollouts=3, search="none", action_temperature=temperature, logged_goals=True)
         return simulation(tiny(), scenes, config).rollouts.state
 
-    plain = simulation(tiny(), scenes, EvaluateConfig(rollouts=3, search="none", logged_goals=True))
-    assert torch.equal(rollouts(1.0 + 1e-9), plain.rollouts.state)
-    cold, warm = rollouts(1e-7), rollouts(3.0)
+    plain, cold, warm = (rollouts(temperature) for temperature in (1.0, 1e-7, 3.0))
+    assert torch.equal(rollouts(1.0 + 1e-9), plain)
     assert (cold == cold[:, :1]).all()
     assert not (warm == warm[:, :1]).all()
     with pytest.raises(ConfigError, match="no discrete actions"):

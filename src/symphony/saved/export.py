@@ -28,11 +28,7 @@ STRAIGHT = 0.5
 
 _TYPES = {AgentType.PEDESTRIAN: "pedestrian", AgentType.CYCLIST: "bicycle"}
 _LANES = {LaneType.FREEWAY: "highway", LaneType.SURFACE_STREET: "urban", LaneType.BIKE_LANE: "bicycleLane"}
-_COLORS = {
-    **dict.fromkeys((SignalState.STOP, SignalState.ARROW_STOP), "red"),
-    **dict.fromkeys((SignalState.CAUTION, SignalState.ARROW_CAUTION), "yellow"),
-    **dict.fromkeys((SignalState.GO, SignalState.ARROW_GO), "green"),
-}
+_COLORS = {"STOP": "red", "CAUTION": "yellow", "GO": "green"}
 
 
 def commonroad(saved: SavedRollouts, rollout: int) -> str:
@@ -47,16 +43,11 @@ def commonroad(saved: SavedRollouts, rollout: int) -> str:
     letters = "".join(word.capitalize() for word in re.findall("[A-Za-z]+", segment.segment_id)) or "Segment"
     # The format's names have room for letters and numbers only: this one tells segments apart.
     number = 1 + zlib.crc32(segment.segment_id.encode()) % 999_999
-    root = ET.Element(
-        "commonRoad",
-        commonRoadVersion="2020a",
-        benchmarkID=f"ZAM_{letters[:60]}-{number}_{rollout + 1}_T-1",
-        timeStepSize=repr(float(segment.dt)),
-        author="",
-        affiliation="",
-        source=f"symphony: segment {segment.segment_id}, rollout {rollout}",
-        date="1970-01-01",
-    )
+    name = f"ZAM_{letters[:60]}-{number}_{rollout + 1}_T-1"
+    about = {"commonRoadVersion": "2020a", "benchmarkID": name, "timeStepSize": repr(float(segment.dt))}
+    about |= {"author": "", "affiliation": ""}
+    about["source"] = f"symphony: segment {segment.segment_id}, rollout {rollout}"
+    root = ET.Element("commonRoad", about, date="1970-01-01")
     location = _add(root, "location")
     for tag, value in (("geoNameId", "-999"), ("gpsLatitude", "999"), ("gpsLongitude", "999")):
         _add(location, tag, value)
@@ -108,11 +99,8 @@ def _obstacles(saved: SavedRollouts, rollout: int) -> list[ET.Element]:
 
 def _state(node: ET.Element, world: World, row: int, step: int, origin: Reals) -> None:
     _point(node, "position", world.position[row, step] + origin[:2])
-    for tag, value in (
-        ("orientation", world.heading[row, step]),
-        ("time", str(step)),
-        ("velocity", world.speed[row, step]),
-    ):
+    values = {"orientation": world.heading[row, step], "time": str(step), "velocity": world.speed[row, step]}
+    for tag, value in values.items():
         _add(_add(node, tag), "exact", value)
 
 
@@ -178,12 +166,10 @@ class _Network:
             side = _add(node, tag)
             for place in bound:
                 _point(side, "point", place)
-        for tag, others in (
-            ("predecessor", [a for a, b in self.flow if b == k]),
-            ("successor", [b for a, b in self.flow if a == k]),
-        ):
-            for other in others:
-                _add(node, tag, ref=self.ids[other])
+        for before in (a for a, b in self.flow if b == k):
+            _add(node, "predecessor", ref=self.ids[before])
+        for after in (b for a, b in self.flow if a == k):
+            _add(node, "successor", ref=self.ids[after])
         for tag, name in (("adjacentLeft", "left_neighbors"), ("adjacentRight", "right_neighbors")):
             # The format knows one on either side.
             for other in [b for a, b in self._pairs(name) if a == k][:1]:
@@ -201,7 +187,8 @@ class _Network:
         node = _add(root, "trafficLight", id=number)
         cycle = _add(node, "cycle")
         states = self.segment.signal_state[light, self.within].tolist()
-        for color, run in groupby(_COLORS.get(SignalState(state), "inactive") for state in states):
+        names = [SignalState(state).name.removeprefix("ARROW_") for state in states]
+        for color, run in groupby(_COLORS.get(name, "inactive") for name in names):
             element = _add(cycle, "cycleElement")
             _add(element, "duration", str(len(list(run))))
             _add(element, "color", color)
@@ -229,7 +216,6 @@ def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
     """
     segment, world, origin = saved.segment, world_of(saved, rollout), saved.segment.origin[:2]
     place = world.position + origin
-    within = slice(saved.start, saved.last + 1)
     agents = []
     for row in np.flatnonzero(world.valid.any(1)).tolist():
         values = np.column_stack([place[row], world.heading[row], world.speed[row]])
@@ -254,7 +240,16 @@ def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
     def lines(found: Polylines) -> list[Any]:
         return [(found[k][:, :2] + origin).tolist() for k in range(len(found))]
 
-    lights = zip(segment.signal_lane, segment.signal_point, segment.signal_state[:, within], strict=True)
+    lights = [
+        {
+            "lane": int(lane),
+            "stop": (point[:2] + origin).tolist(),
+            "states": [SignalState(state).name.lower() for state in states[saved.start : saved.last + 1]],
+        }
+        for lane, point, states in zip(
+            segment.signal_lane, segment.signal_point, segment.signal_state, strict=True
+        )
+    ]
     return {
         "segment": segment.segment_id,
         "rollout": rollout,
@@ -262,13 +257,6 @@ def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
         "steps": saved.steps,
         "failed": saved.failed.get(rollout),
         "agents": agents,
-        "lights": [
-            {
-                "lane": int(lane),
-                "stop": (point[:2] + origin).tolist(),
-                "states": [SignalState(state).name.lower() for state in states],
-            }
-            for lane, point, states in lights
-        ],
+        "lights": lights,
         "map": {name: lines(getattr(segment.road, name)) for name in ("lanes", "boundary", "marks")},
     }

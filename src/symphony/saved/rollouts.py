@@ -191,18 +191,13 @@ def saved_rollouts(
     others: str = "",
     failed: Mapping[int, str] | None = None,
 ) -> SavedRollouts:
-    """The rollouts [B, K, ...] of one run segment, in a row of B scenes, ready to be written.
-
-    Beside them the numbers [B, K, N] of the routes that agents followed, -1 for none; a search, [B, R], of which they
-    are the leaves, with its tree kept; the driver of all interactive agents, or of each; what drives background
-    agents; and why rollouts failed, by their numbers.
+    """The rollouts [B, K, ...] of one run segment, in a row of B scenes, ready to be written; with the numbers
+    [B, K, N] of the routes that agents followed, -1 for none, a search, [B, R], of which they are the leaves, the
+    driver of all interactive agents, or of each, what drives background agents, and why rollouts failed, by number.
     """
     real, background = (_array(part[row]) for part in (scenes.interactive_valid, scenes.background))
     steps = min(segment.num_steps - 1, rollouts.collision.shape[-2])
-    collision, offroad, counted = (
-        _array(part[row])[:, :steps, real]
-        for part in (rollouts.collision, rollouts.offroad, rollouts.counted)
-    )
+    collision, offroad, counted = (_array(part[row])[:, :steps, real] for part in rollouts[1:])
     names = [driver] * len(real) if isinstance(driver, str) else driver
     names = [BACKGROUND + others if rule else name for name, rule in zip(names, background, strict=True)]
     number, routes = _routes(scenes, row, goal, len(counted))
@@ -230,9 +225,7 @@ def _routes(
 ) -> tuple[NDArray[np.int64], Polylines]:
     """Goals [K, N] as numbers of the distinct routes that some rollout follows, and these."""
     agents = scenes.interactive.shape[1]
-    if goal is None:
-        return np.full((rollouts, agents), -1, np.int64), Polylines.of([])
-    chosen = _array(goal[row]).astype(np.int64)
+    chosen = np.full((rollouts, agents), -1) if goal is None else _array(goal[row])
     place = np.broadcast_to(np.arange(agents), chosen.shape)
     # Agents have routes of their own: a pair (agent, route) is one line.
     pairs, number = np.unique(np.stack([place, chosen], -1).reshape(-1, 2), axis=0, return_inverse=True)

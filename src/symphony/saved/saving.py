@@ -30,7 +30,7 @@ from symphony.saved.rollouts import PLAYBACK, SavedRollouts, saved_rollouts
 _MEMORY = ("batch", "device", "metric", "workers", "engine")
 """Settings that change no rollout."""
 PLANNED = 16
-"""Run segments simulated at a time with a planner, of which each rollout has a copy, unless more are asked for."""
+"""Run segments simulated at a time with a planner, of which each rollout has a copy."""
 
 
 def save_simulation(
@@ -48,33 +48,24 @@ def save_simulation(
     """Simulate an agent on every run segment of a dataset, which has routes if there are goals or a planner, and keep
     the rollouts in a folder, segment by segment.
 
-    What was cut short goes on where it stopped: rollouts depend on the seed and the segment, not on the batch.
+    What was cut short goes on where it stopped: rollouts depend on the seed and the segment, not on the batch. Of a
+    search all branches are kept with their scores, if asked for; log playback is kept as it is.
 
-    Args:
-        path: the folder.
-        agent: on ``config.device``; log playback is kept as it is.
-        dataset: in the agent's action space.
-        config: how it is simulated; with a planner without a search unless one is asked for.
-        keep_tree: of a search keep all branches with their scores, too.
-        planner: of the ego, or its name, as of :func:`symphony.planners.interface.planner_maker`; the agent drives
-            the other interactive agents. Segments whose ego can't be driven are put on record as failed.
-        planner_seconds: that it has for one answer; more fails the run.
-        goals: of agents, as :func:`symphony.rollouts.control.given_goals` reads them.
-        progress: called with the segments done and their total.
+    A planner (see :func:`symphony.planners.interface.planner_maker`) drives the ego, the agent the other interactive
+    agents, without a search unless one is asked for. It has so many seconds for one answer; more fails the run.
+    Segments whose ego can't be driven are put on record as failed. Goals of agents are those of
+    :func:`symphony.rollouts.control.given_goals`. ``progress`` is called with the segments done and their total.
 
     Raises:
         DataError: the folder holds something else, or the disk refuses.
         ConfigError: the agent can't be simulated so, or a goal can't be reached.
-        NotFiniteError: a network of the agent puts out a number that is not finite.
     """
     if planner:
         planner_maker(planner)  # or complain before anything is simulated
         config = beside_planner(config)
     settings = plain_settings(config, agent, dataset.interactive, dataset.duration)
-    if goals:
-        settings["goal"] = list(goals)
-    if planner:
-        settings |= {"planner": source_of(planner), "planner_seconds": planner_seconds}
+    settings |= {"goal": list(goals)} if goals else {}
+    settings |= {"planner": source_of(planner), "planner_seconds": planner_seconds} if planner else {}
     name = planner_name(planner) if planner else ""
     about = About.of(agent.name, dataset.store, settings, seed=config.seed, planner=name)
     with RolloutWriter(path, about) as writer:
@@ -84,9 +75,8 @@ def save_simulation(
             todo = [i for i in todo if _has_ego(writer, dataset, i, config.rollouts)]
         done = len(names) - len(todo)
         drive = partial(_drive, agent, dataset, config, keep_tree, planner, planner_seconds, tuple(goals))
-        together = segments_together(agent, config, dataset.interactive)
-        if planner and not config.batch:
-            together = min(together, PLANNED)
+        most = PLANNED if planner and not config.batch else len(names)
+        together = min(segments_together(agent, config, dataset.interactive), max(most, 1))
         with closing(shared(drive, batches(todo, together, config), config, dataset)) as results:
             for saved in results:
                 for one in saved:
