@@ -238,7 +238,7 @@ def _read_scores(run: Path, files: Sequence[Path]) -> list[dict[str, Any]]:
     if files:
         return _in_order([read_evaluation(file) for file in files])
     kept = kept_evaluations(run)
-    return [choose_evaluation(run, kept)[1]] if kept else []
+    return [choose_evaluation(run, kept)] if kept else []
 
 
 def _check_scores(record: dict[str, Any], config: TrainConfig, step: int) -> None:

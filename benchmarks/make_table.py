@@ -39,7 +39,7 @@ def main(args: Sequence[str] | None = None) -> int:
         kept = [str(word) for flag, value in flags.items() if flag not in given for word in (flag, value)]
         recipe(recipe_of(method), None, [*kept, *further])
     table = ["table", "--setting", "main", "--runs", str(out)]
-    return symphony([*table, "--format", "markdown", "--out", str(out / "table.md")]) or symphony(table)
+    return symphony([*table, "--out", str(out / "table.md")]) or symphony(table)
 
 
 if __name__ == "__main__":

@@ -20,14 +20,14 @@ from symphony.training import trainer as training
 from symphony.training.logging import Tracker
 
 STEPS = 8
-OWNERS = {"_update": Trainer, "log": Tracker, "evaluate_dataset": hooks, "fsync": os, "rmtree": shutil}
+OWNERS = {"_update": Trainer, "log": Tracker, "evaluate": hooks, "fsync": os, "rmtree": shutil}
 OWNERS |= dict.fromkeys(("rename", "replace", "unlink"), Path)
 DEATHS = (
     ("_update", 1, ""),
     ("fsync", 5, ""),  # in the first checkpoint, when some of its files are written
     ("rename", 0, ""),  # when all of them are
     ("log", 2, ""),  # after it, half a record being written
-    ("evaluate_dataset", 0, ""),
+    ("evaluate", 0, ""),
     ("replace", 0, "metrics.jsonl"),  # while it is taken up again, its records being written anew
     ("replace", 0, "agent.json"),  # and before that
     ("rmtree", 0, ""),  # between the next checkpoint and the removal of old ones

@@ -3,42 +3,40 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
-from symphony.config import Method
-from symphony.evaluation.paper import METRICS
+from symphony.config import EvaluateConfig, Method
 from symphony.evaluation.records import evaluation_name, keep_evaluation
-from symphony.evaluation.table import Comparison, Entry
+from symphony.evaluation.table import METRICS, Entry
 
 METHODS = get_args(Method)
+CONFIG = asdict(EvaluateConfig())
+CONFIG |= {"search": "none", "score": "discriminator", "goals": "tree", "trees": 0, "rule": ""}
+CONFIG |= {"interactive": 2, "metric": []}
 
 
 def make_record(values: dict[str, float] | None = None, **changes: Any) -> dict[str, Any]:
-    numbers = dict.fromkeys(METRICS, 1.0) | (values or {})
-    config = {
-        "search": "none",
-        "trees": 0,
-        "branches": 0,
-        "rule": "",
-        "interactive": 2,
-        "rollouts": 16,
-        "duration": 0,
-        "seed": 0,
-        "logged_goals": False,
-    }
+    numbers = dict.fromkeys(METRICS, 1.0) | {"curvature_jsd_floor": 0.5} | (values or {})
     counts = [0] * 100 + [3] + [0] * 100
     return {
         "format": 2,
         **numbers,
+        "collision_rate_at_states": numbers["collision_rate"],
         "segments": 4,
         "run": {"updates": 0, "named": False, "checkpoint": 0},
         "data": {"name": "test", "checksum": "ab" * 32},
-        "config": config | changes,
-        "playback": {"collision_rate": 0.5, "offroad_time": 0.25},
-        "constant_velocity": dict.fromkeys(METRICS, 2.0),
+        "config": CONFIG | changes,
+        "playback": {
+            "collision_rate_at_states": 0.5,
+            "collision_rate": 0.5,
+            "offroad_time": 0.25,
+            "ade": 0.0,
+        },
+        "constant_velocity": dict.fromkeys([*METRICS, "collision_rate_at_states"], 2.0),
         "cost": {"simulation": 6.0},
         "curvature": {"policy": counts, "log": counts},
     }
@@ -67,6 +65,6 @@ def full_table(seeds: int = 3, methods: Any = METHODS) -> list[Entry]:
     ]
 
 
-def row_of(comparison: Comparison, method: str) -> Any:
-    (row,) = (row for row in comparison.rows if row.method == method)
+def row_of(table: dict[str, Any], method: str) -> Any:
+    (row,) = (row for row in table["rows"] if row["method"] == method)
     return row

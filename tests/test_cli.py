@@ -148,8 +148,6 @@ def test_installed_command_prints_the_version() -> None:
         "train bc --data x --out y --steps 0",
         "evaluate --data x",
         "evaluate playback --data x --unknown 1",
-        "evaluate playback --data x --planner idm --figure f.png",
-        "evaluate playback --data x --planner idm --metrics wosac",
         "plot curves --out a.png",
         "plot segment x --segment 0 --out a.png --interactive 0",
         "simulate playback --data x --out y --runs 5 --segments a",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,9 +20,8 @@ from helpers_segments import crossing, hide, straight_road
 from symphony import keys
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import CheckpointError
-from symphony.cli import main
 from symphony.collectors import BeamSearchCollector
-from symphony.config import AgentSpec, DiscriminatorConfig, SearchConfig, TrainConfig, read_json, to_json
+from symphony.config import AgentSpec, SearchConfig, TrainConfig, read_json, to_json
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
@@ -96,6 +96,7 @@ def test_each_method_trains_its_networks(trained: Trained, store: Path, tmp_path
 def test_metrics_tell_of_every_network(trained: Trained, method: str) -> None:
     records = read_metrics(trained(method))
     assert [r["step"] for r in records] == [1, 2, 3, 4]
+    assert not {"NaN", "Infinity"} & set(re.findall(r"\w+", (trained(method) / "metrics.jsonl").read_text()))
     learned = {"policy": "accuracy", "goals": "accuracy_top3", "discriminator": "auc"}
     for name, statistic in learned.items():
         loss = f"loss_{name}"
@@ -107,15 +108,6 @@ def test_metrics_tell_of_every_network(trained: Trained, method: str) -> None:
     # Who searches learns from the survivors.
     assert ("policy_nll_rollout" in records[0]) == ("search_offroad_kept" in records[0]) == ("ts" in method)
     assert {name.removeprefix("loss_") for name in records[0] if name.startswith("loss_")} == NETWORKS[method]
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_metrics_are_strict_json(trained: Trained, method: str) -> None:
-    def refuse(name: str) -> None:
-        raise AssertionError(f"{name} is not JSON")
-
-    for line in (trained(method) / "metrics.jsonl").read_text(encoding="utf-8").splitlines():
-        json.loads(line, parse_constant=refuse)
 
 
 def test_the_seed_decides_the_weights(trained: Trained, store: Path, tmp_path: Path) -> None:
@@ -174,22 +166,6 @@ def test_a_warm_start_that_does_not_fit_leaves_no_run_behind(
         train(tiny("bc", store, tmp_path / "run", warm_start=source))
     # Else the corrected command would be refused: the folder holds a run already.
     assert not (tmp_path / "run" / "config.json").exists()
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_configurations_survive_json(store: Path, tmp_path: Path, method: str) -> None:
-    settings = tiny(
-        method,
-        store,
-        tmp_path,
-        warm_start=tmp_path / "other",
-        search=SearchConfig(updates=1),
-        discriminator=DiscriminatorConfig(features="paper"),
-    )
-    file = tmp_path / "config.json"
-    for one in (settings, replace(settings, warm_start=None)):
-        file.write_text(to_json(one))
-        assert read_json(TrainConfig, file) == one
 
 
 GONE: list[tuple[str, Any, Any]] = [
@@ -262,18 +238,6 @@ def test_checkpoints_must_fall_on_searches(store: Path, tmp_path: Path) -> None:
     for bad in ({"temperature": 0}, {"branches": 0}, {"updates": 0}):
         with pytest.raises(ConfigError):
             SearchConfig(**bad)
-
-
-def test_the_command_line_trains_and_evaluates_a_method_with_search(store: Path, tmp_path: Path) -> None:
-    out, file = tmp_path / "run", tmp_path / "numbers.json"
-    command = f"""train bc_ts --data {store} --out {out} --steps 2 --states 16 --wandb disabled
-        --agent.hidden 8 --agent.num-points 12 --search.branches 2 --search.states 8"""
-    assert main(command.split()) == 0
-    assert {name.split(".")[0] for name in weights(out)} == NETWORKS["bc_ts"]
-    command = f"evaluate {out} --data {store} --json {file} --rollouts 2 --search tree --branches 2"
-    assert main(command.split()) == 0
-    assert math.isfinite(json.loads(file.read_text())["ade"])
-    assert main(f"evaluate {out} --data {store} --rollouts 4 --search tree --branches 2".split()) == 1
 
 
 def searched(store: Path, out: Path, **changes: Any) -> tuple[dict[str, Tensor], SearchReplay]:

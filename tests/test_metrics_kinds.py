@@ -10,9 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from symphony.geometry import box_corners, rotate
 from symphony.metrics import CollisionKind, CollisionKinds, collision_kinds, collisions
-from symphony.metrics.kinds import _separations
 
 KIND = CollisionKind
 STEPS, DT = 10, 0.2
@@ -210,38 +208,6 @@ def test_padding_order_and_batch_change_nothing():
         assert (value[..., 3:] <= 0).all()
 
 
-def test_the_log_of_interactive_agents_is_not_read_and_leading_dimensions_broadcast():
-    inputs = crowd(6)
-    log = inputs["log_state"][:, :1].expand(3, 4, 6, STEPS + 1, 5).clone()
-    subject = inputs["subject"][:, :1]
-    rows = torch.arange(3)[:, None, None], torch.arange(4)[:, None], subject.expand(3, 4, 3)
-    driven = torch.cat([inputs["state"][..., :3], torch.zeros_like(inputs["state"][..., :2])], -1)
-    log[rows] = driven
-    size = inputs["size"][:, :1]
-    valid = torch.ones(log.shape[:-1], dtype=torch.bool)
-    flags = collisions(log[..., :2], log[..., 2], size, valid, subject)
-    shared = inputs["log_state"][:, :1].clone()
-    shared[torch.arange(3)[:, None, None], 0, subject] = torch.nan
-    arguments = {**inputs, "collided": flags, "size": size, "subject": subject}
-    narrow = collision_kinds(**{**arguments, "log_state": shared, "log_valid": valid[:, :1]})
-    wide = collision_kinds(**{**arguments, "log_state": log, "log_valid": valid})
-    assert (narrow.kind >= 0).any()
-    for a, b in zip(narrow, wide, strict=True):
-        assert torch.equal(a, b)
-
-
-def test_who_is_first_in_a_rollout():
-    none = -1
-    kind = torch.tensor([[4, 5], [5, 0], [0, none], [none, none], [1, 1]])
-    step = torch.tensor([[7, 3], [4, 4], [0, none], [none, none], [2, 2]])
-    playback = torch.tensor([[True, False], [False, False], [True, False], [False, False], [False, True]])
-    first, with_playback = CollisionKinds(kind, step, kind, playback).first()
-    assert first.tolist() == [5, 0, 0, -1, 1]
-    assert with_playback.tolist() == [False, False, True, False, True]
-    empty = CollisionKinds(*(value[:, :0] for value in (kind, step, kind, playback)))
-    assert empty.first()[0].tolist() == [-1] * 5
-
-
 def test_flags_that_are_not_those_of_the_states_are_refused():
     inputs = stage(EGO, (12, 30, 0, 2), subjects=(0, -1))
     flags = torch.zeros(2, STEPS, dtype=torch.bool)
@@ -249,24 +215,6 @@ def test_flags_that_are_not_those_of_the_states_are_refused():
     flags[0, 3] = True
     with pytest.raises(ValueError, match=r"28\.\d+ m away from all others"):
         collision_kinds(**{**inputs, "collided": flags})
-
-
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
-def test_gaps_along_and_across_are_those_of_the_corners(seed):
-    generator = torch.Generator().manual_seed(seed)
-    position, size = (torch.rand(2, 50, 2, generator=generator, dtype=torch.float64) * k for k in (20, 6))
-    heading = torch.rand(2, 50, generator=generator, dtype=torch.float64) * 1.5
-    poses = torch.cat([position, heading[..., None]], -1)
-    found = torch.stack(_separations(*poses, *size))
-    mean = heading.mean(0)
-    corners = [rotate(box_corners(position[k], heading[k], size[k]), -mean[:, None]) for k in (0, 1)]
-    middle = rotate(position, -mean)
-    for axis in (0, 1):
-        reach = sum((corners[k][..., axis] - middle[k, :, None, axis]).amax(-1) for k in (0, 1))
-        away = middle[1, :, axis] - middle[0, :, axis]
-        torch.testing.assert_close(found[1 + axis], away.abs() - reach)
-    torch.testing.assert_close(found[0], middle[1, :, 0] - middle[0, :, 0])
 
 
 def test_nobody_meets_whom_is_on_another_level():

@@ -30,14 +30,6 @@ def along_y(arrival: float, speed: float = 10.0) -> torch.Tensor:
     return along_x(arrival, speed).flip(-1)
 
 
-def joining(arrival: float, speed: float = 10.0) -> torch.Tensor:
-    """Comes from the side at 45 degrees into +x at the origin."""
-    x = speed * (TIME - arrival)
-    return torch.stack(
-        (torch.where(x < 0, x * math.sqrt(0.5), x), torch.where(x < 0, x * math.sqrt(0.5), 0.0)), -1
-    )
-
-
 def gap(a: torch.Tensor, b: torch.Tensor, **changes: torch.Tensor) -> float:
     masks = {"first_valid": EVERY, "second_valid": EVERY, **changes}
     return passing_gap(a, b, **masks, dt=DT).item()
@@ -46,11 +38,6 @@ def gap(a: torch.Tensor, b: torch.Tensor, **changes: torch.Tensor) -> float:
 @pytest.mark.parametrize(("mine", "theirs"), [(4.0, 6.0), (6.0, 4.5), (5.0, 5.5), (3.0, 10.0)])
 def test_crossing_paths(mine: float, theirs: float) -> None:
     assert gap(along_x(mine), along_y(theirs)) == pytest.approx(theirs - mine, abs=0.1)
-
-
-@pytest.mark.parametrize(("mine", "theirs"), [(4.0, 6.0), (6.0, 4.5)])
-def test_merging_paths(mine: float, theirs: float) -> None:
-    assert gap(along_x(mine), joining(theirs)) == pytest.approx(theirs - mine, abs=0.2)
 
 
 def test_paths_that_do_not_meet() -> None:
@@ -91,10 +78,6 @@ def test_a_path_does_not_go_from_where_it_was_seen_to_its_padding() -> None:
     assert math.isnan(gap(along_x(4.0), apart, second_valid=once))
 
 
-def test_both_at_once() -> None:
-    assert gap(along_x(5.0), along_y(5.0)) == 0
-
-
 @given(st.floats(1, 11), st.floats(1, 11), st.floats(2, 20), st.floats(2, 20), st.floats(-4, 4))
 @example(1.0, 1.0, 2.0, 3.0, 1.0)
 def test_swapping_turning_and_moving(
@@ -129,12 +112,6 @@ def test_statistics() -> None:
     assert found.pairs == 2
     assert (found.kept, found.reversed, found.apart) == pytest.approx((5 / 8, 1 / 8, 2 / 8))
     assert found.gap_error == pytest.approx((1 + 4 + 1 + 0 + 0 + 1 + 1) / 7)
-
-
-def test_the_log_keeps_its_own_order() -> None:
-    log = torch.tensor([2.0, -1.0, math.nan])
-    found = order_statistics(log.expand(5, 3), log)
-    assert (found.pairs, found.kept, found.reversed, found.apart, found.gap_error) == (2, 1, 0, 0, 0)
 
 
 def test_nothing_to_count() -> None:

@@ -200,17 +200,6 @@ def test_a_segment_seen_twice_is_refused() -> None:
     assert same(metrics.compute(), before)
 
 
-def test_standard_error_of_equal_segments_is_that_of_the_mean() -> None:
-    inputs = random_inputs(4, batch=12)
-    inputs["logged"], inputs["bounded"] = torch.ones_like(inputs["logged"]), torch.ones(12, dtype=torch.bool)
-    metrics = scored(inputs)
-    rows, numbers = metrics.rows(), metrics.compute()
-    for name in NUMBERS[:4]:
-        values = np.array([row[name] for row in rows])
-        assert numbers[name] == pytest.approx(values.mean())
-        assert numbers[f"{name}_se"] == pytest.approx(values.std(ddof=1) / math.sqrt(12))
-
-
 def test_standard_errors_match_the_bootstrap() -> None:
     metrics = scored(random_inputs(5, batch=150))
     numbers = metrics.compute()
@@ -256,12 +245,6 @@ def test_a_group_without_anything_to_count_is_no_sample() -> None:
         assert (full[name], full[f"{name}_se"]) == (without[name], without[f"{name}_se"])
     inputs["logged"][2] = False
     assert math.isnan(scored(inputs).compute()["ade_se"])
-
-
-def test_no_branch_visited_gives_no_divergence() -> None:
-    numbers = scored(random_inputs(7) | {"curvature": [np.zeros(0)] * 7}).compute()
-    assert math.isnan(numbers["curvature_jsd"])
-    assert not math.isnan(numbers["ade"])
 
 
 def test_a_rollout_whose_agents_leave_is_measured_over_the_steps_they_are_there() -> None:

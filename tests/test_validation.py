@@ -91,7 +91,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch) -> Scripted:
 
     def script(*values: float) -> None:
         left = iter(values)
-        monkeypatch.setattr("symphony.training.hooks.evaluate_dataset", lambda *_: Found(next(left)))
+        monkeypatch.setattr("symphony.training.hooks.evaluate", lambda *_: Found(next(left)))
 
     return script
 

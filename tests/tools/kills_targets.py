@@ -25,12 +25,12 @@ from symphony.data.convert import convert
 from symphony.data.generate import Harvest, Plan, Task
 from symphony.data.store import SegmentStore
 from symphony.evaluation import evaluate
-from symphony.evaluation.pictures import RolloutKeeper
 from symphony.evaluation.records import evaluation_record
 from symphony.files import write_json
 from symphony.learning import SceneDataset
 from symphony.recipes import train
 from symphony.saved.folder import About, RolloutWriter
+from symphony.saved.rollouts import SavedRollouts
 from symphony.saved.saving import save_simulation
 
 AGENT = "pretrained:bc_ts_h"
@@ -106,8 +106,13 @@ def _simulate(store: Path, out: Path) -> None:
 
 def _evaluate(store: Path, out: Path) -> None:
     agent, segments = load_agent(AGENT), SegmentStore(store)
-    keeper = RolloutKeeper(RolloutWriter(out / "rollouts", About.of(AGENT, segments, CONFIG)))
-    found = evaluate(agent, segments, CONFIG, baselines=True, observe=keeper)
+    writer = RolloutWriter(out / "rollouts", About.of(AGENT, segments, CONFIG))
+
+    def observe(item: int, saved: SavedRollouts) -> None:
+        if not writer.has(saved.segment.segment_id):
+            writer.add(saved)
+
+    found = evaluate(agent, segments, CONFIG, baselines=True, observe=observe)
     write_json(out / "found.json", evaluation_record(agent, found, segments))
 
 

@@ -17,11 +17,10 @@ from scipy import stats
 from helpers_saved import played
 from helpers_store import fill
 from symphony.cli import main
-from symphony.cli.planners import table_text
 from symphony.cli.shared import number_cell
 from symphony.config import EvaluateConfig
 from symphony.evaluation import evaluate
-from symphony.evaluation.planners import winners
+from symphony.evaluation.planners import COLUMNS, planners_text, winners
 from symphony.evaluation.report import Report, add_segment, total_numbers
 from symphony.metrics.intervals import beta_quantile, t_quantile, zero_bound
 from symphony.saved.folder import About, save_rollouts
@@ -134,13 +133,7 @@ def record(name: str, scores: list[float], **numbers: Any) -> dict[str, Any]:
         | {"at_fault_collision": False, "red_lights": None, "offroad_time": 0.0, "progress_ratio": score}
         for k, score in enumerate(scores)
     ]
-    found = dict.fromkeys(("score", "collision_rate", "at_fault_collision_rate", "red_light_rate"), 0.0)
-    found |= {
-        "offroad_time": 0.0,
-        "progress_ratio": 1.0,
-        "failed_runs": 0,
-        "score": 100 * float(np.mean(scores)),
-    }
+    found: dict[str, Any] = dict.fromkeys(COLUMNS, 0.0) | {"score": 100 * float(np.mean(scores))}
     settings = {"interactive": 2}
     return {"planner": name, "crowd": "playback", "settings": settings, "per_run": runs, **found, **numbers}
 
@@ -156,15 +149,11 @@ def test_who_wins_with_few_runs_is_decided_by_t(last: float, verb: str) -> None:
     assert line.startswith(f"log: a {verb},")
 
 
-def test_the_table_of_planners_has_bounds_and_says_how_collisions_count() -> None:
+def test_the_table_of_planners_has_bounds_and_dashes() -> None:
     first = record("a", [1.0, 1.0], collision_rate_bound=77.64, red_light_rate=None)
-    second = record(
-        "b", [1.0, 0.0], collision_rate=50.0, collision_rate_se=50.0, collision_rate_at_states=0.0
-    )
-    text = table_text([first, second])
+    text = planners_text([first, record("b", [1.0, 0.0], collision_rate=50.0, collision_rate_se=50.0)])
     assert "0.0 (≤ 77.6)" in text
     assert "50.0 ± 50.0" in text
-    assert text.splitlines()[-1].endswith("at states only: b among log 0.0 %")
     assert "–" in text
 
 

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.evaluation.planners import run_score
-from symphony.evaluation.report import grouped_mean
-from symphony.metrics.intervals import beta_quantile, t_quantile
+from symphony.metrics.intervals import beta_quantile, grouped_mean, t_quantile
 
 Run = dict[str, Any]
 

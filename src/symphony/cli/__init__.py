@@ -45,6 +45,13 @@ GONE = {
     "plot rollouts": "`symphony evaluate RUN --data DIR --figure FILE` draws rollouts, and so does `symphony view`",
     "plot curvature --data": "evaluate the runs first: `symphony evaluate RUN --data DIR`",
     "data convert --append": "convert into another store, and put the two together by `symphony data merge`",
+    "evaluate --planner": "`symphony simulate RUN --planner NAME --data DIR --out SIM`, then `symphony planners SIM`",
+    "evaluate --planner-seconds": "`symphony simulate` has it, beside its `--planner`",
+    "planners --format": "the table is in Markdown, and `--json` writes its numbers",
+    "table --relations": "`python benchmarks/relations.py RUN ...` of a checkout prints them",
+    "table --paired": "`python benchmarks/relations.py RUN ... --paired METHOD` of a checkout prints them",
+    "table --each": "a method that was simulated in several ways has a row for each",
+    "table --columns": "`symphony evaluate RUN --data DIR --details` prints these numbers",
     "simulate --agents": "the agent is named without an option: `symphony simulate RUN --data DIR --out SIM`",
 }
 """Commands and options that are gone, and what takes their place."""

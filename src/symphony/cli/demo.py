@@ -14,9 +14,10 @@ from symphony.files import write_json
 
 if TYPE_CHECKING:
     from symphony.render import Clip
+    from symphony.saved.rollouts import SavedRollouts
 
-PANELS = 3
-"""Run segments in the picture."""
+PANELS, SHOWN = 3, 8
+"""Run segments in the picture, and rollouts that are drawn of each."""
 BASELINES = {"log playback": "playback", "constant velocity": "constant_velocity"}
 """Agents by their titles, of which only the numbers are shown."""
 
@@ -38,9 +39,8 @@ class Demo(shared.Command):
             self._show_all()
 
     def _show_all(self) -> None:
-        from symphony.evaluation.pictures import ClipKeeper
         from symphony.learning.demonstrations import evenly_spaced
-        from symphony.render import draw_clips
+        from symphony.render import draw_clips, saved_clip
 
         began, run, numbers = time.perf_counter(), self.out / "bc_h", self.out / "metrics.json"
         test = symphony.builtin_store("test")
@@ -52,11 +52,12 @@ class Demo(shared.Command):
         def show(agents: dict[str, str], picture: Path) -> None:
             """Evaluate agents by their titles, and show them beside those before."""
             for title, agent in agents.items():
-                keeper = ClipKeeper(items, title=f"{title}: ")
+                kept: dict[int, SavedRollouts] = {}
                 with shared.progress(f"evaluating {title}") as advance:
-                    found = symphony.evaluate(agent, test, settings, advance, observe=keeper)
+                    found = symphony.evaluate(agent, test, settings, advance, observe=kept.__setitem__)
                 rows.append({**found.numbers(), "agent": title})
-                clips.extend([] if title in BASELINES else keeper.clips)
+                for saved in [] if title in BASELINES else map(kept.__getitem__, items):
+                    clips.append(saved_clip(saved, SHOWN, f"{title}: {saved.segment.segment_id}"))
             shared.print_metrics(rows, "Built-in test segments")
             write_json(numbers, {"rows": rows, "seconds": round(time.perf_counter() - began, 1)})
             draw_clips(clips, picture, columns=len(items))

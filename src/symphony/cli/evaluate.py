@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
 import symphony
 from symphony.cli import shared
-from symphony.cli.planners import table_text
 from symphony.config import WosacSettings
-from symphony.errors import ConfigError
 
 if TYPE_CHECKING:
-    from symphony.agents import Agent
-    from symphony.data.store import SegmentStore
+    from collections.abc import Sequence
+
+    from symphony.saved.folder import RolloutWriter
+    from symphony.saved.rollouts import SavedRollouts
+
+PANELS, SHOWN = 6, 8
+"""Run segments in one picture, and rollouts that are drawn of each."""
 
 
 class Evaluate(shared.Simulation):
@@ -25,8 +27,7 @@ class Evaluate(shared.Simulation):
 
     The log itself and agents at constant velocity are evaluated beside the agent. A run keeps what was found in its
     folder, as evaluations/NAME.json, where `symphony table` looks for it; the same evaluation made again replaces it.
-    With --segments or --planner the folder of a run is left as it is. The numbers of a planner are those of `symphony
-    planners`.
+    With --segments the folder of a run is left as it is.
     """
 
     json: shared.Json = None
@@ -42,13 +43,7 @@ class Evaluate(shared.Simulation):
     #: same search or without it (see docs/wosac.md).
     metrics: tuple[Literal["wosac"], ...] = ()
 
-    def __post_init__(self) -> None:
-        if self.planner and (self.figure is not None or self.metrics or self.config.metric):
-            raise ConfigError("--figure, --metrics and --metric go without --planner: they are of the agent")
-
     def __call__(self) -> None:
-        if self.planner:
-            return self._evaluate_planner()
         from symphony.evaluation.records import evaluation_record, keep_evaluation
 
         if self.figure is not None:
@@ -63,11 +58,31 @@ class Evaluate(shared.Simulation):
 
             # Complain now, not after the work.
             scorable(store, chosen or range(len(store)), WosacSettings.of(config).future)
-        keepers = self._keepers(agent, store, len(chosen or store))
-        observe: Any = (lambda *found: [keeper(*found) for keeper in keepers.values()]) if keepers else None
+        shown: Sequence[int] = ()
+        kept: list[SavedRollouts] = []
+        writer: RolloutWriter | None = None
+        if self.figure is not None:
+            from symphony.learning.demonstrations import evenly_spaced
+
+            shown = evenly_spaced(len(chosen or store), PANELS)
+        if self.save_rollouts is not None:
+            from symphony.saved import folder
+            from symphony.saved.saving import plain_settings
+
+            plain = plain_settings(config, agent, agent.interactive, agent.duration)
+            about = folder.About.of(agent.name, store, plain, seed=config.seed)
+            writer = folder.RolloutWriter(self.save_rollouts, about)
+
+        def observe(item: int, saved: SavedRollouts) -> None:
+            if item in shown:
+                kept.append(saved)
+            if writer is not None and not writer.has(saved.segment.segment_id):
+                writer.add(saved)
+
+        watched: dict[str, Any] = {"observe": observe} if shown or writer is not None else {}
         with shared.progress(f"evaluating {agent.name}") as advance:
-            more: dict[str, Any] = {"items": chosen or None, "observe": observe}
-            found = symphony.evaluate(agent, store, config, advance, baselines=True, **more)
+            items = chosen or None
+            found = symphony.evaluate(agent, store, config, advance, items=items, baselines=True, **watched)
         record = evaluation_record(agent, found, store)
         if self.metrics:
             rows = chosen or range(len(store))
@@ -84,38 +99,8 @@ class Evaluate(shared.Simulation):
         if self.keep and not chosen:
             keep_evaluation(agent.name, record)
         if self.figure is not None:
-            from symphony.render import draw_clips
+            from symphony.render import draw_clips, saved_clip
 
-            draw_clips(keepers["figure"].clips, self.figure)
-
-    def _keepers(self, agent: Agent, store: SegmentStore, count: int) -> dict[str, Any]:
-        """What looks at the rollouts of every run segment: to draw some of them, to save them."""
-        keepers: dict[str, Any] = {}
-        if self.figure is not None:
-            from symphony.evaluation.pictures import PANELS, ClipKeeper
-            from symphony.learning.demonstrations import evenly_spaced
-
-            title = f"{shared.short_name(agent.name)}: "
-            keepers["figure"] = ClipKeeper(evenly_spaced(count, PANELS), title=title)
-        if self.save_rollouts is not None:
-            from symphony.evaluation.pictures import RolloutKeeper
-            from symphony.saved.folder import About, RolloutWriter
-            from symphony.saved.saving import plain_settings
-
-            plain = plain_settings(self.config, agent, agent.interactive, agent.duration)
-            about = About.of(agent.name, store, plain, seed=self.config.seed)
-            keepers["rollouts"] = RolloutKeeper(RolloutWriter(self.save_rollouts, about))
-        return keepers
-
-    def _evaluate_planner(self) -> None:
-        from symphony.evaluation.planners import planner_record
-
-        with TemporaryDirectory() as spare:
-            folder = self.simulated(self.save_rollouts or Path(spare))
-            store = symphony.SegmentStore(self.data)
-            chosen = shared.segment_indices(store, self.segments) or range(len(store))
-            folder = folder.only(store.ids[i] for i in chosen)
-            record = planner_record(folder)
-            if shared.write_numbers(self.json, record):
-                sys.stdout.write(table_text([record]))
-            shared.tell_failed(folder)
+            name = shared.short_name(agent.name)
+            clips = [saved_clip(saved, SHOWN, f"{name}: {saved.segment.segment_id}") for saved in kept]
+            draw_clips(clips, self.figure)

@@ -41,7 +41,7 @@ class Curvature(shared.Command):
         for run in self.runs:
             folder = run_folder(run)
             method = method_name(read_run(folder)["method"])
-            held = choose_evaluation(folder, kept_evaluations(folder), self.evaluation)[1]["curvature"]
+            held = choose_evaluation(folder, kept_evaluations(folder), self.evaluation)["curvature"]
             policy, log = (np.array(held[part], dtype=np.int64) for part in ("policy", "log"))
             divergence = 1000 * float(jensen_shannon(policy, log))
             panels[f"{method} ({run}): JSD {divergence:.2f} · 10⁻³"] = policy, log

@@ -14,8 +14,8 @@ from tyro.conf import Positional, arg
 
 import symphony
 from symphony.config import EvaluateConfig
-from symphony.config.checks import Bounds, Count, Positive
-from symphony.config.evaluation import MOST_SECONDS, Engine
+from symphony.config.checks import Bounds, Count
+from symphony.config.evaluation import Engine
 from symphony.errors import AllFailedError, ConfigError, printable
 from symphony.files import Lock, json_text, naming, write_file, write_json
 
@@ -53,7 +53,7 @@ class Command:
 
 
 class Simulation(Command):
-    """An agent on run segments, alone or beside a planner."""
+    """An agent on run segments."""
 
     #: Folder of a run (see `symphony train`), `pretrained:NAME` (an agent that comes with the
     #: package), `playback` (the log itself), `constant_velocity` or `idm` (the intelligent driver model, along the
@@ -61,38 +61,8 @@ class Simulation(Command):
     agent: Annotated[Positional[str], arg(metavar="RUN")]
     data: Path  # Store of run segments to simulate.
     segments: Segments = ()
-    #: Planner that drives the ego, while the agent drives the other interactive agents: `idm`, `log`, or one of your
-    #: own: a file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback`
-    #: as the agent all others play back the log. Nothing is searched then, unless --search, --branches or --trees say
-    #: so: a search asks the planner once for each branch.
-    planner: str = ""
-    #: Seconds that a planner has for one answer; a longer one fails the run.
-    planner_seconds: Annotated[Positive, Bounds(most=MOST_SECONDS)] = 60.0
     trust_code: TrustCode = False
     config: Annotated[EvaluateConfig, arg(name="")] = field(default_factory=EvaluateConfig)
-
-    def simulated(
-        self, out: Path, runs: int = 0, goals: tuple[str, ...] = (), tree: bool = True
-    ) -> RolloutFolder:
-        """Simulate and save in a folder; the other arguments are those of the command."""
-        from symphony.learning.demonstrations import evenly_spaced
-        from symphony.rollouts.crowd import crowd_dataset
-        from symphony.rollouts.driving import beside_planner, spread_runs
-        from symphony.saved.saving import save_simulation
-
-        agent = symphony.load_agent(self.agent, self.config.device, trust_code=self.trust_code)
-        store, planner = symphony.SegmentStore(self.data), self.planner
-        config = beside_planner(self.config) if planner else self.config
-        chosen = segment_indices(store, self.segments)
-        if runs:
-            count, config = spread_runs(agent, config, runs, len(store))
-            chosen = evenly_spaced(len(store), count)
-        # Beside log playback nobody else is simulated.
-        crowd = {"default": 1 if planner and agent.policy is None else agent.interactive}
-        dataset = crowd_dataset(store, agent, config, chosen or None, routes=bool(planner or goals), **crowd)
-        beside: dict[str, Any] = {"planner": planner, "planner_seconds": self.planner_seconds, "goals": goals}
-        with progress(f"simulating {agent.name}") as advance:
-            return save_simulation(out, agent, dataset, config, keep_tree=tree, progress=advance, **beside)
 
 
 def tell_failed(folder: RolloutFolder) -> None:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 from tyro.conf import arg
 
+import symphony
 from symphony.cli import shared
 from symphony.config import EvaluateConfig
+from symphony.config.checks import Bounds, Positive
+from symphony.config.evaluation import MOST_SECONDS
 from symphony.errors import ConfigError
-
-if TYPE_CHECKING:
-    pass
 
 
 class Simulate(shared.Simulation):
@@ -23,6 +23,13 @@ class Simulate(shared.Simulation):
     """
 
     out: Path  # Folder of the rollouts.
+    #: Planner that drives the ego, while the agent drives the other interactive agents: `idm`, `log`, or one of your
+    #: own: a file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback`
+    #: as the agent all others play back the log. Nothing is searched then, unless --search, --branches or --trees say
+    #: so: a search asks the planner once for each branch.
+    planner: str = ""
+    #: Seconds that a planner has for one answer; a longer one fails the run.
+    planner_seconds: Annotated[Positive, Bounds(most=MOST_SECONDS)] = 60.0
     #: Number of runs to simulate (a run is one rollout of one segment) in place of `rollouts`: of as many segments as
     #: there are, evenly spread, and as few of each as it takes; a few more where the number can't be divided so. 0:
     #: all segments, `rollouts` of each.
@@ -39,6 +46,24 @@ class Simulate(shared.Simulation):
             raise ConfigError("--runs says how many rollouts a segment gives: it goes without --rollouts")
 
     def __call__(self) -> None:
-        found = self.simulated(self.out, runs=self.runs, goals=self.goal, tree=self.tree)
+        from symphony.learning.demonstrations import evenly_spaced
+        from symphony.rollouts.crowd import crowd_dataset
+        from symphony.rollouts.driving import beside_planner, spread_runs
+        from symphony.saved.saving import save_simulation
+
+        agent = symphony.load_agent(self.agent, self.config.device, trust_code=self.trust_code)
+        store, planner, goals = symphony.SegmentStore(self.data), self.planner, self.goal
+        config = beside_planner(self.config) if planner else self.config
+        chosen = shared.segment_indices(store, self.segments)
+        if self.runs:
+            count, config = spread_runs(agent, config, self.runs, len(store))
+            chosen = evenly_spaced(len(store), count)
+        # Beside log playback nobody else is simulated.
+        crowd = {"default": 1 if planner and agent.policy is None else agent.interactive}
+        dataset = crowd_dataset(store, agent, config, chosen or None, routes=bool(planner or goals), **crowd)
+        beside: dict[str, Any] = {"planner": planner, "planner_seconds": self.planner_seconds, "goals": goals}
+        with shared.progress(f"simulating {agent.name}") as advance:
+            beside |= {"keep_tree": self.tree, "progress": advance}
+            found = save_simulation(self.out, agent, dataset, config, **beside)
         shared.say(f"{len(found)} run segments in {self.out}: symphony view {self.out}")
         shared.tell_failed(found)

@@ -11,7 +11,6 @@ from symphony.config.evaluation import (
     EvaluateConfig,
     PaperData,
     Setting,
-    TableColumns,
     TableFormat,
     WosacSettings,
 )
@@ -30,5 +29,5 @@ from symphony.config.training import (
 __all__ = [
     "METHODS", "AgentConfig", "AgentSpec", "DiscriminatorConfig", "EvaluateConfig", "MGAILConfig", "Method",
     "PaperData", "PerturbConfig", "PreviewConfig", "RunConfig", "Score", "SearchConfig", "Setting",
-    "TableColumns", "TableFormat", "TrainConfig", "ValidationConfig", "WosacSettings", "read_json", "to_json",
+    "TableFormat", "TrainConfig", "ValidationConfig", "WosacSettings", "read_json", "to_json",
 ]  # fmt: skip

@@ -19,11 +19,7 @@ Setting = Literal["main", "long", "many"]
 """Tables of the paper: 10 s with 2 interactive agents, 20 s with 2, 10 s with 8."""
 PaperData = Literal["proprietary", "womd"]
 """Data sets whose figures the paper gives."""
-TableFormat = Literal["text", "markdown", "latex", "json"]
-TableColumns = Literal["split", "standing", "corrected", "goals"]
-"""Columns of a table on request: collisions with playback agents and the rest, who stands at the end, divergence
-corrected for sampling, what the search made of the goals.
-"""
+TableFormat = Literal["markdown", "json"]
 MOST = 128
 """Agents of a run segment that are driven, at most."""
 TOGETHER = 64

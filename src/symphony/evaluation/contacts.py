@@ -1,7 +1,10 @@
-"""Collisions of single rollouts: with whom, when and how; and how long until the next one.
+"""Collisions of single rollouts: with whom, when, how and whose fault; and how long until the next one.
 
-Contacts are found between the states. Of each pair the first counts; whose fault it was is for
-:mod:`symphony.evaluation.fault`.
+Contacts are found between the states; of each pair the first counts. Fault is judged at the time of contact, in the
+sense of nuPlan's at-fault collisions (https://github.com/motional/nuplan-devkit): an agent answers for what it drives
+into, not for being driven into. To these rules come red lights, lanes that an agent leaves, and lane changes in front
+of others that are too close by RSS (Shalev-Shwartz et al., "On a formal model of safe and scalable self-driving
+cars", 2017, definition 1). ``docs/metrics.md`` has them in a table.
 
 Metres, radians, seconds. Legend: A agents, U states of a rollout, M evaluated agents, E contacts.
 """
@@ -13,156 +16,258 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 import torch
-from numpy.typing import NDArray
+from torch import from_numpy
 
-from symphony.geometry import boxes_overlap, levels_apart, meeting_time
-from symphony.metrics import meetings
-from symphony.metrics.kinds import kind_of_contact
+from symphony.data.segment import AgentType
+from symphony.evaluation.driving import Bools, Heights, Indices, Lanes, Lights, Reals
+from symphony.geometry import boxes_overlap, levels_apart, meeting_time, pose_at
+from symphony.geometry.boxes import covers, relation
+from symphony.metrics import CollisionKind, meetings
+from symphony.metrics.kinds import STANDING, kind_of_contact
 from symphony.saved.rollouts import World
 
-Reals = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Bools = NDArray[np.bool_]
-
-STILL = 0.05
-"""Speed in m/s up to which an agent that is hit has stopped, so that nothing is its fault (as in nuPlan)."""
-HORIZON = 5.0
-"""Seconds ahead that a collision is looked for."""
+STILL = 0.05  # speed in m/s up to which an agent that is hit has stopped, so that nothing is its fault (as in nuPlan)
+HORIZON = 5.0  # seconds ahead that a collision is looked for
+RED_SECONDS = 5.0  # for which an agent that ran a red light answers for whom it meets across
+CUT_IN_SECONDS = 4.0  # before a contact in which a lane change may have caused it
+RESPONSE, SPEED_UP, BRAKE_LEAST, BRAKE_MOST = 1.0, 3.5, 4.0, 8.0
+"""Of RSS: seconds until the one behind brakes, its acceleration until then, its braking then, and the braking of the
+one ahead, m/s^2 (defaults of Intel's ad-rss-lib)."""
+CORNER = 0.5  # metres behind the front bumper that are its corner
+ENTERING = 0.1  # speed in m/s towards the other from which on an agent is on its way into a lane
+_TIE = 1e-3  # metres by which the normals of the other must part the boxes more than the own ones
+_EDGE = 0.1  # metres an agent may reach over the edge of its lane and still count as within it
+_AHEAD = 30.0  # metres that a path is thought to go on straight after a contact
+_FRONT, _REAR, _SIDE = range(3)
 _SLACK = 1e-3
-_PAIRS = 1 << 20
-"""Pairs of agents, times states, held at a time."""
 
 
 class Contacts(NamedTuple):
-    """The first contact of evaluated agents with each other agent, all [E], by time, then agent.
+    """The first contact of evaluated agents with each other agent, all [E], by time, then agent."""
 
-    Attributes:
-        agent: row of A.
-        other: row of A.
-        step: the state after it, from 1.
-        share: of the step before that state after which they first overlap, from 0 to 1.
-        kind: :class:`symphony.metrics.CollisionKind`, from the agent's point of view, whoever the other is.
-        at_state: whether they overlap at any state, not only between two.
-    """
-
-    agent: Indices
-    other: Indices
-    step: Indices
-    share: Reals
-    kind: Indices
-    at_state: Bools
+    agent: Indices  # row of A
+    other: Indices  # row of A
+    step: Indices  # the state after it, from 1
+    share: Reals  # of the step before that state after which they first overlap, from 0 to 1
+    kind: Indices  # a CollisionKind, from the agent's point of view, whoever the other is
+    at_state: Bools  # whether they overlap at any state, not only between two
 
 
 def contacts(worlds: Sequence[World], evaluated: Indices) -> list[Contacts]:
-    """Collisions of evaluated agents in each of some rollouts of one segment, from their second states on.
+    """Return the collisions of evaluated agents [M] in each of some rollouts of one segment.
 
-    Nobody meets others on another level.
-
-    Args:
-        worlds: everyone in each rollout.
-        evaluated: [M] rows of A.
+    The first states do not count, and nobody meets others on another level.
     """
 
     def stacked(name: str) -> torch.Tensor:
-        return torch.from_numpy(np.stack([getattr(world, name) for world in worlds]))
+        return from_numpy(np.stack([getattr(world, name) for world in worlds]))
 
-    found = meetings(
-        stacked("position"),
-        stacked("heading"),
-        stacked("size"),
-        stacked("valid"),
-        torch.from_numpy(evaluated).expand(len(worlds), -1),
-        None if worlds[0].height is None else stacked("height"),
-    )
+    position, heading, size, valid = map(stacked, ("position", "heading", "size", "valid"))
+    height = None if worlds[0].height is None else stacked("height")
+    subject = from_numpy(evaluated).expand(len(worlds), -1)
+    found = meetings(position, heading, size, valid, subject, height)
     parts = evaluated[found.subject.numpy()], found.other.numpy(), found.step.numpy() + 1, found.share.numpy()
     return [
-        _first(world, *(part[found.row.numpy() == number] for part in parts))
-        for number, world in enumerate(worlds)
+        _first(world, *(part[found.row.numpy() == k] for part in parts)) for k, world in enumerate(worlds)
     ]
 
 
 def _first(world: World, agent: Indices, other: Indices, step: Indices, share: Reals) -> Contacts:
     """Of the contacts of each pair the first, in order of time."""
-    boxes = (
-        torch.from_numpy(part)
+    boxes = [
+        from_numpy(part)
         for row in (agent, other)
         for part in (world.position[row, step], world.heading[row, step], world.size[row])
-    )
-    overlap = boxes_overlap(*boxes).numpy()
+    ]
     order = np.lexsort((other, agent, share, step))
     pair = (agent * len(world.size) + other)[order]
     _, first, number = np.unique(pair, return_index=True, return_inverse=True)
-    at_state = np.bincount(number, overlap[order], len(first)) > 0
+    at_state = np.bincount(number, boxes_overlap(*boxes).numpy()[order], len(first)) > 0
     turn = np.argsort(first)
     agent, other, step, share = (part[order[first[turn]]] for part in (agent, other, step, share))
-    kind = kind_of_contact(
-        pose_ends(world, agent, other, step),
-        pose_ends(world, other, agent, step),
-        torch.from_numpy(share),
-        *(torch.from_numpy(world.size[row]) for row in (agent, other)),
-    )
+    poses = pose_ends(world, agent, other, step), pose_ends(world, other, agent, step)
+    sizes = (from_numpy(world.size[row]) for row in (agent, other))
+    kind = kind_of_contact(*poses, from_numpy(share), *sizes)
     return Contacts(agent, other, step, share, kind.numpy(), at_state[turn])
 
 
 def pose_ends(world: World, row: Indices, other: Indices, step: Indices) -> tuple[torch.Tensor, torch.Tensor]:
-    """Poses [E, 5] (x, y, heading, velocity x, velocity y) of agents before and after the step of a contact.
+    """Return poses [E, 5] (x, y, heading, velocity x, velocity y) of agents before and after the step of a contact.
 
     Where one of the two was not there before the step, both are those after it.
     """
     seen = world.valid[row, step - 1] & world.valid[other, step - 1]
-    before, after = (
-        torch.from_numpy(
-            np.concatenate(
-                [world.position[row, at], world.heading[row, at, None], world.velocity[row, at]], -1
-            )
-        )
-        for at in (np.where(seen, step - 1, step), step)
-    )
-    return before, after
+    poses = np.concatenate([world.position, world.heading[..., None], world.velocity], -1)
+    return from_numpy(poses[row, np.where(seen, step - 1, step)]), from_numpy(poses[row, step])
 
 
 def time_to_collision(world: World, evaluated: Indices) -> Reals:
-    """Seconds [M, U] until an evaluated agent would first overlap one that is not behind it, if both go on so.
+    """Return the seconds [M, U] until an evaluated agent would first overlap one ahead of it, if both go on so.
 
     Everyone keeps velocity and heading, and nobody meets others on another level. Infinite if that is more than
     :data:`HORIZON` away, or the agent has stopped or is not there.
     """
-    size = max(1, _PAIRS // max(world.valid.size, 1))
-    blocks = [evaluated[k : k + size] for k in range(0, max(len(evaluated), 1), size)]
-    return np.concatenate([_time_to_collision(world, part) for part in blocks])
-
-
-def _time_to_collision(world: World, evaluated: Indices) -> Reals:
-    # By component, which is many times faster: [M, A, U] how much more everyone has than the evaluated agents.
-    x, y, u, v = (
-        values[None] - values[evaluated, None]
-        for values in np.moveaxis(np.concatenate([world.position, world.velocity], -1), -1, 0)
-    )
+    found = np.full((len(evaluated), world.valid.shape[1]), math.inf)
     radius = 0.5 * np.linalg.norm(world.size, axis=-1)
-    heading = world.heading[evaluated, None]
-    near = x * np.cos(heading) + y * np.sin(heading) > 0
-    moving = np.linalg.norm(world.velocity[evaluated], axis=-1) > STILL
-    near &= (moving & world.valid[evaluated])[:, None] & world.valid[None]
-    near &= (evaluated[:, None] != np.arange(len(radius)))[..., None]
-    if world.height is not None:
-        level = torch.from_numpy(world.height)
-        near &= ~levels_apart(level[evaluated, None], level[None]).numpy()
-    # Boxes can only meet where the circles around them do, which are nearest to each other at this time.
-    soonest = np.clip(-(x * u + y * v) / np.maximum(u * u + v * v, 1e-12), 0, HORIZON)
-    reach = (radius[evaluated, None] + radius[None] + _SLACK)[..., None]
-    near &= (x + soonest * u) ** 2 + (y + soonest * v) ** 2 <= reach * reach
-    who, other, step = near.nonzero()
-    one = evaluated[who]
-    parts = (
-        np.stack([x[near], y[near]], -1),
-        np.stack([u[near], v[near]], -1),
-        world.heading[one, step],
-        world.size[one],
-        world.heading[other, step],
-        world.size[other],
+    for row, best in zip(evaluated.tolist(), found, strict=True):
+        away, speed = world.position - world.position[row], world.velocity - world.velocity[row]
+        heading = world.heading[row]
+        near = (away * np.stack([np.cos(heading), np.sin(heading)], -1)).sum(-1) > 0
+        near &= world.valid & world.valid[row] & (np.linalg.norm(world.velocity[row], axis=-1) > STILL)
+        near[row] = False
+        if world.height is not None:
+            level = from_numpy(world.height)
+            near &= ~levels_apart(level[row], level).numpy()
+        # Boxes can only meet where the circles around them do, which are nearest to each other at this time.
+        soonest = -(away * speed).sum(-1) / np.maximum(np.square(speed).sum(-1), 1e-12)
+        nearest = away + np.clip(soonest, 0, HORIZON)[..., None] * speed
+        near &= np.square(nearest).sum(-1) <= np.square(radius[row] + radius + _SLACK)[:, None]
+        other, step = near.nonzero()
+        me = heading[step], world.size[np.full(len(step), row)]
+        parts = (away[near], speed[near], *me, world.heading[other, step], world.size[other])
+        np.minimum.at(best, step, meeting_time(*map(from_numpy, parts)).numpy())
+    return np.where(found <= HORIZON, found, math.inf)
+
+
+class _Party(NamedTuple):
+    """One of the two at each contact; height and level are None where the map has no levels."""
+
+    row: Indices  # [E] of A
+    position: Reals  # [E, 2]
+    heading: Reals  # [E]
+    velocity: Reals  # [E, 2]
+    speed: Reals  # [E] along the heading
+    size: Reals  # [E, 2] of the box
+    height: Heights  # [E, 2]
+
+
+def at_fault(world: World, found: Contacts, lanes: Lanes, offroad: Bools, lights: Lights) -> Bools:
+    """Return whether the agent of each contact is at fault [E].
+
+    ``offroad`` says which agents are off the road [A, U]; ``lights`` are red ones that any agent of a contact ran.
+    """
+    if not len(found.agent):
+        return np.zeros(0, bool)
+    segment = lanes.segment
+    me, it = _party(world, found.agent, found.other, found), _party(world, found.other, found.agent, found)
+    kind, face = found.kind, _face(me, it)
+    ends = np.isin(kind, [CollisionKind.INTO_LEADER, CollisionKind.REAR_ENDED])
+    behind = kind == CollisionKind.INTO_LEADER
+    rear, front = np.where(behind, me.row, it.row), np.where(behind, it.row, me.row)
+    # Who is on foot changes no lanes.
+    driving = ends & (segment.agent_type[front] != AgentType.PEDESTRIAN)
+    cut_in = np.zeros(len(kind), bool)
+    cut_in[driving] = _cut_in(world, rear[driving], front[driving], found.step[driving], segment.dt)
+    across = np.isin(kind, [CollisionKind.CROSSING, CollisionKind.ONCOMING])
+    red, their_red = (across & _ran_red(party.row, found.step, lights, segment.dt) for party in (me, it))
+    reaching = _reaching(me, it, lanes) | offroad[me.row, found.step]
+    backing = (me.speed < -STILL) & (face == _REAR)
+    beside = np.isin(kind, [CollisionKind.ONCOMING, CollisionKind.SIDESWIPE])
+    # The first that holds decides.
+    rules = (
+        (red, True),
+        (cut_in, ~behind),
+        (np.abs(me.speed) <= STILL, False),
+        (their_red, False),
+        (backing, True),
+        (ends & ~behind, False),
+        (np.abs(it.speed) <= STANDING, True),
+        (behind, True),
+        (beside & reaching, True),
+        (beside & _reaching(it, me, lanes), False),
+        (face == _FRONT, True),
+        (face == _SIDE, reaching),
     )
-    found = meeting_time(*(torch.from_numpy(part) for part in parts)).numpy()
-    best = np.full((len(evaluated), world.valid.shape[1]), math.inf)
-    np.minimum.at(best, (who, step), found)
-    return np.where(best <= HORIZON, best, math.inf)
+    holds, verdicts = zip(*rules, strict=True)
+    return np.select(holds, [np.broadcast_to(verdict, kind.shape) for verdict in verdicts], False)
+
+
+def _party(world: World, row: Indices, other: Indices, found: Contacts) -> _Party:
+    ends = torch.stack(pose_ends(world, row, other, found.step), 1)
+    share = from_numpy(found.share)
+    position, heading = (part.numpy() for part in pose_at(ends[..., :2], ends[..., 2], share))
+    velocity = (ends[:, 0, 3:] + share[:, None] * (ends[:, 1, 3:] - ends[:, 0, 3:])).numpy()
+    # The box may have turned by half a turn; where its front is the state says.
+    heading = heading + np.pi * (np.cos(heading - world.heading[row, found.step]) < 0)
+    speed = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
+    height = None if world.height is None else world.height[row, found.step]
+    return _Party(row, position, heading, velocity, speed, world.size[row], height)
+
+
+def _face(me: _Party, it: _Party) -> Indices:
+    """With which side each agent touches [E]: that whose normal parts the boxes last, or of a corner that meets the
+    other's side, the end it is at. Who is only beside the last :data:`CORNER` before the front touches that.
+    """
+    away = from_numpy(it.position - me.position)
+    pair = relation(away[:, 0], away[:, 1], from_numpy(me.heading), from_numpy(it.heading))
+    reach = covers(pair.turn, from_numpy(me.size), from_numpy(it.size))
+    places = np.stack([part.numpy() for part in (*pair.in_a, *pair.in_b)])
+    gaps = np.abs(places) - np.stack([part.numpy() for part in reach])
+    gaps[:2] += _TIE
+    which = gaps.argmax(0)
+    # The normal from here to the other, along or across that one.
+    turn = it.heading - me.heading
+    towards = np.sign(places[2:]) * np.stack([np.cos(turn), -np.sin(turn)])
+    corner = np.where(np.where(which == 2, towards[0], towards[1]) > 0, _FRONT, _REAR)
+    end = np.where(places[0] > 0, _FRONT, _REAR)
+    rearmost = places[0] - (reach[0].numpy() - 0.5 * me.size[:, 0])
+    side = np.where(rearmost > 0.5 * me.size[:, 0] - CORNER, _FRONT, _SIDE)
+    return np.where(which == 0, end, np.where(which == 1, side, corner))
+
+
+def _ran_red(row: Indices, step: Indices, lights: Lights, dt: float) -> Bools:
+    since = step[:, None] - lights.step
+    return ((lights.agent == row[:, None]) & (since >= 0) & (since <= RED_SECONDS / dt)).any(-1)
+
+
+def _reaching(me: _Party, it: _Party, lanes: Lanes) -> Bools:
+    """Whether an agent is in no lane, reaches over that edge of its lane which is towards the other, or over the far
+    one on its way in [E].
+    """
+    graph, lane = lanes.graph, lanes.lane_of(me.position, me.heading, me.height)
+    found = np.ones(len(lane), bool)
+    inside = lane >= 0
+    number = np.searchsorted(graph.usable_lanes, lane[inside])
+    lines, here = graph.index.geometry[number], me.position[inside]
+    along = shapely.line_locate_point(lines, shapely.points(here))
+    way = graph.index.heading(number, along)
+    nearest = shapely.get_coordinates(shapely.line_interpolate_point(lines, along))
+    left = np.stack([-np.sin(way), np.cos(way)], -1)
+    turn = me.heading[inside] - way
+    covered = 0.5 * (np.abs(np.stack([np.sin(turn), np.cos(turn)], -1)) * me.size[inside]).sum(-1)
+    side = np.sign(((it.position[inside] - here) * left).sum(-1))
+    off = side * ((here - nearest) * left).sum(-1)
+    coming = side * (me.velocity[inside] * left).sum(-1) > ENTERING
+    reach = 0.5 * lanes.width[lane[inside]] + _EDGE - covered
+    found[inside] = (off > reach) | (coming & (off < -reach))
+    return found
+
+
+def _cut_in(world: World, rear: Indices, front: Indices, step: Indices, dt: float) -> Bools:
+    """Whether the one ahead came into the path of the one behind shortly before their contact, nearer than is safe
+    [E]. The path is the one driven, so that a bend or a lane change of the one behind makes nobody cut in.
+    """
+    times = np.maximum(step[:, None] + np.arange(-math.ceil(CUT_IN_SECONDS / dt) - 1, 0), 0)
+    ours, theirs = world.position[rear[:, None], times], world.position[front[:, None], times]
+    seen = world.valid[rear[:, None], times]
+    heading, last = world.heading[rear[:, None], times], world.heading[rear, step]
+    direction = np.stack([np.cos(heading), np.sin(heading)], -1)
+    onward = world.position[rear, step] + _AHEAD * np.stack([np.cos(last), np.sin(last)], -1)
+    # Before it was seen there is no path: it begins where it was first seen.
+    start = np.take_along_axis(ours, seen.argmax(1)[:, None, None], 1)
+    path = np.concatenate([np.where(seen[..., None], ours, start), onward[:, None]], 1)
+    half = 0.5 * world.size
+    away = shapely.distance(shapely.linestrings(path)[:, None], shapely.points(theirs))
+    beside = away - (half[rear, 1] + half[front, 1])[:, None]
+    outside = seen & world.valid[front[:, None], times] & (beside > 0)
+    # The first state from which on it stays in the path.
+    entered = outside.shape[1] - outside[:, ::-1].argmax(1)
+    at = np.arange(len(rear)), np.minimum(entered, outside.shape[1] - 1)
+    gap = ((theirs[at] - ours[at]) * direction[at]).sum(-1) - half[rear, 0] - half[front, 0]
+    behind, ahead = (np.linalg.norm(world.velocity[row, times[at]], axis=-1) for row in (rear, front))
+    # Beyond this many metres the one behind can stop (RSS).
+    faster = behind + RESPONSE * SPEED_UP
+    travel = behind * RESPONSE + 0.5 * SPEED_UP * RESPONSE**2 + faster**2 / (2 * BRAKE_LEAST)
+    return outside.any(1) & (gap < np.maximum(travel - ahead**2 / (2 * BRAKE_MOST), 0.0))

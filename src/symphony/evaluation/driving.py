@@ -6,45 +6,86 @@ Metres, radians, seconds. Legend: A agents, U states, T = U - 1 steps, M evaluat
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from torch import from_numpy
 
-from symphony.data.segment import SignalState
-from symphony.evaluation.contacts import Bools, Indices, Reals
-from symphony.evaluation.lanes import Heights, Lanes
+from symphony.data.levels import levels_of
+from symphony.data.segment import LaneType, RunSegment, SignalState
 from symphony.geometry import levels_apart
 from symphony.geometry.polylines import stations_along
 from symphony.metrics.kinds import STANDING
-from symphony.roadgraph.lines import line_strings, turn_between
+from symphony.roadgraph import LaneGraph, lane_of
+from symphony.roadgraph.lines import Near, line_strings, turn_between
 from symphony.roadgraph.routes import ends_inside
 from symphony.saved.rollouts import SavedRollouts, World
 
+Reals = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Heights = NDArray[np.float32] | None
+"""Height and level [..., 2] of places; None where the map has no levels, so that all are on one."""
+
+LANE_WIDTH, BIKE_WIDTH = 3.6, 1.6  # metres, of lanes whose width is not known
 RED = (SignalState.STOP, SignalState.ARROW_STOP)
-SAME_WAY = math.pi / 2
-"""Largest angle between an agent and its lane."""
-WRONG_WAY = 2 * math.pi / 3
-"""Smallest angle between an agent and a lane that it drives the wrong way."""
-IN_LANE = 2.0
-"""Metres from a centre line within which an agent is in the lane."""
-PAST_END = 5.0
-"""Metres from the end of a route beyond which an agent has gone on."""
-SECONDS = 3.0
-"""For which an agent must stand on a free road to block it."""
-FREE = 15.0
-"""Metres ahead of the front that nobody is in and no light that is not green."""
-CROSSING = 25.0
-"""Metres within which others that move across are given way to."""
-ASIDE = 0.5
-"""Metres beside its box that an agent wants to be free."""
-_FOLLOWED = 3.0
-"""Metres from a centre line, on average, within which a path follows the lane."""
-_PASSED = 5.0
-"""Metres that the front may be past a stop point and still wait for its light."""
-_LANE = 2.5
-"""Metres aside within which a light is that of an agent's lane."""
+GREEN = (SignalState.GO, SignalState.ARROW_GO)
+SAME_WAY = math.pi / 2  # largest angle between an agent and its lane
+WRONG_WAY = 2 * math.pi / 3  # smallest angle between an agent and a lane that it drives the wrong way
+IN_LANE = 2.0  # metres from a centre line within which an agent is in the lane
+PAST_END = 5.0  # metres from the end of a route beyond which an agent has gone on
+SECONDS = 3.0  # for which an agent must stand on a free road to block it
+FREE = 15.0  # metres ahead of the front that nobody is in and no light that is not green
+CROSSING = 25.0  # metres within which others that move across are given way to
+ASIDE = 0.5  # metres beside its box that an agent wants to be free
+_FOLLOWED = 3.0  # metres from a centre line, on average, within which a path follows the lane
+_PASSED = 5.0  # metres that the front may be past a stop point and still wait for its light
+_LANE = 2.5  # metres aside within which a light is that of an agent's lane
+
+
+class Lanes:
+    """The lanes of a run segment, and which of them are on the level of a place (see :mod:`symphony.data.levels`).
+
+    ``graph`` says how they connect, ``width`` [L] how wide they are, in metres; nominal where the source does not.
+    """
+
+    def __init__(self, segment: RunSegment) -> None:
+        road = segment.road
+        self.segment, self.graph, self._levels = segment, LaneGraph(road), levels_of(segment)
+        nominal = np.where(road.lane_type == LaneType.BIKE_LANE, BIKE_WIDTH, LANE_WIDTH)
+        self.width = np.where(np.isnan(road.lane_width), nominal, road.lane_width).astype(np.float64)
+
+    def near(self, position: Reals, reach: float, height: Heights) -> Near:
+        """Return pairs of a position [n, 2] and a lane on its level at most ``reach`` metres away."""
+        found = self.graph.index.near(position, reach)
+        return found if height is None else found.only(self._kept(found, height))
+
+    def lane_of(self, position: Reals, heading: Reals, height: Heights) -> Indices:
+        """Return the lane on its level that each agent [n] is in, see :func:`symphony.roadgraph.lane_of`."""
+        keep = None if height is None else lambda near: self._kept(near, height)
+        return lane_of(self.graph, position, heading, keep=keep)
+
+    @cached_property
+    def light_height(self) -> NDArray[np.float32]:
+        """[Q, 2] height and level of the lights, taken from their lanes."""
+        place = np.zeros((len(self.segment.signal_lane), 3))
+        for light, lane in enumerate(self.segment.signal_lane.tolist()):
+            line = self.segment.road.lanes[lane]
+            away = np.linalg.norm(line[:, :2] - self.segment.signal_point[light, :2], axis=-1)
+            place[light] = line[away.argmin()]
+        return self._levels.at(place)
+
+    def _kept(self, near: Near, height: NDArray[np.float32]) -> Bools:
+        place = np.zeros((len(near.line), 3))
+        for number in np.unique(near.line):
+            mine = near.line == number
+            line = self.segment.road.lanes[int(self.graph.usable_lanes[number])].astype(np.float64)
+            arc = np.append(0, np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T)))
+            place[mine] = np.stack([np.interp(near.along[mine], arc, part) for part in line.T], -1)
+        return ~levels_apart(from_numpy(self._levels.at(place)), from_numpy(height[near.point])).numpy()
 
 
 class Lights(NamedTuple):
@@ -56,18 +97,12 @@ class Lights(NamedTuple):
 
 
 def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Lights:
-    """Red lights that the evaluated agents [M] of one rollout ran.
+    """Return the red lights that the evaluated agents [M] of one rollout ran.
 
     An agent runs a light if its front crosses the stop point in the direction of the lane, within the lane's width
     and on its level, while the light is red (a plain or arrow stop, not a flashing one), and it follows that lane: of
     the lanes whose lights it crosses at once the one that its path is nearest to, before the stop point where that
-    lies at the end of the lane, behind it elsewhere.
-
-    Args:
-        world: everyone.
-        evaluated: [M] rows of A.
-        lanes: the map, with the lights and their states in all steps of the log.
-        start: step of the log at which the first state lies.
+    lies at the end of the lane, behind it elsewhere. ``start`` is the step of the log at which the first state lies.
     """
     segment, graph = lanes.segment, lanes.graph
     known = np.flatnonzero(graph.length[segment.signal_lane] > 0)
@@ -113,7 +148,7 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
 
 
 def wrong_way(world: World, evaluated: Indices, lanes: Lanes) -> Bools:
-    """[M, U] whether an evaluated agent drives in a lane that leads the other way, and in none that leads its way."""
+    """Return [M, U] whether an evaluated agent drives in a lane that leads the other way, and in none of its way."""
     seen = world.valid[evaluated] & (np.abs(world.speed[evaluated]) > STANDING)
     position, heading = world.position[evaluated][seen], world.heading[evaluated][seen]
     near = lanes.near(position, IN_LANE, None if world.height is None else world.height[evaluated][seen])
@@ -127,17 +162,11 @@ def wrong_way(world: World, evaluated: Indices, lanes: Lanes) -> Bools:
 
 
 def blocking(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Bools:
-    """[M, U] when evaluated agents block traffic.
+    """Return [M, U] when evaluated agents block traffic.
 
     That is, they stand (:data:`symphony.metrics.kinds.STANDING`) in a lane that goes on, for :data:`SECONDS` or more,
     while nobody is in their way ahead or crosses it, no light ahead is other than green, and the log, where it has
     the agent, moves. All this is on their level.
-
-    Args:
-        world: everyone.
-        evaluated: [M] rows of A.
-        lanes: the map, its lights and the log.
-        start: step of the log at which the first state lies.
     """
     segment = lanes.segment
     within = slice(start, start + world.valid.shape[1])
@@ -150,7 +179,7 @@ def blocking(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Bool
     row = evaluated[who]
     height = None if world.height is None else world.height[row, step]
     free = _goes_on(lanes, world.position[row, step], world.heading[row, step], height)
-    free &= _nobody_ahead(world, row, step) & _green(world, row, step, lanes, start, height)
+    free &= _nobody_ahead(world, row, step, height) & _green(world, row, step, lanes, start, height)
     found[who[free], step[free]] = True
     return _long(found, segment.dt)
 
@@ -184,20 +213,18 @@ def _goes_on(lanes: Lanes, position: Reals, heading: Reals, height: Heights) -> 
     return found
 
 
-def _nobody_ahead(world: World, row: Indices, step: Indices) -> Bools:
+def _nobody_ahead(world: World, row: Indices, step: Indices, height: Heights) -> Bools:
     ahead, left = _seen_from(world, row, step, world.position[:, step].swapaxes(0, 1))
     turn = (world.heading[:, step] - world.heading[row, step]).T
     cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-    along, across = (
-        0.5 * (one * world.size[:, 0] + two * world.size[:, 1]) for one, two in ((cos, sin), (sin, cos))
-    )
+    along = 0.5 * (cos * world.size[:, 0] + sin * world.size[:, 1])
+    across = 0.5 * (sin * world.size[:, 0] + cos * world.size[:, 1])
     there = world.valid[:, step].T & (row[:, None] != np.arange(len(world.size)))
-    if world.height is not None:
+    if world.height is not None and height is not None:
         level = from_numpy(world.height[:, step].swapaxes(0, 1))
-        there &= ~levels_apart(level, from_numpy(world.height[row, step])[:, None]).numpy()
-    near = (ahead + along > 0) & (ahead - along < FREE)
+        there &= ~levels_apart(level, from_numpy(height)[:, None]).numpy()
     wide = 0.5 * world.size[row, 1][:, None] + ASIDE
-    in_the_way = near & (np.abs(left) - across < wide)
+    in_the_way = (ahead + along > 0) & (ahead - along < FREE) & (np.abs(left) - across < wide)
     moves = np.abs(world.speed[:, step].T) > STANDING
     crossing = moves & (sin > math.sin(math.pi / 4)) & (np.hypot(ahead, left) < CROSSING) & (ahead > -along)
     return ~(there & (in_the_way | crossing)).any(1)
@@ -211,31 +238,16 @@ def _green(world: World, row: Indices, step: Indices, lanes: Lanes, start: int, 
     if height is not None:
         near &= ~levels_apart(from_numpy(height[:, None]), from_numpy(lanes.light_height)).numpy()
     state = segment.signal_state[:, np.minimum(start + step, segment.num_steps - 1)].T
-    green = (state == SignalState.GO) | (state == SignalState.ARROW_GO)
-    return ~(near & ~green).any(1)
+    return np.asarray(~(near & ~np.isin(state, GREEN)).any(1))
 
 
-class Progress(NamedTuple):
-    """Metres [K, M] along the way.
+def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> tuple[Reals, Reals, Reals]:
+    """Return the metres [K, M] that evaluated agents got on: in all, while the log has them, and what the log got on.
 
-    Attributes:
-        driven: what evaluated agents got on in all; NaN where one went on beyond a route that ends inside the map.
-        compared: what they got on while the log has them; NaN where ``driven`` is.
-        logged: what the log itself got on.
-    """
-
-    driven: Reals
-    compared: Reals
-    logged: Reals
-
-
-def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> Progress:
-    """How far evaluated agents (numbers [M] of the driven ones) got on.
-
-    It is measured along the route that an agent follows, and beyond its end along the path of the log, where the log
-    goes on from there. A route that passes a place twice is followed in order
-    (:func:`symphony.geometry.polylines.stations_along`). For an agent that goes on where both end but the map does
-    not it is NaN. Without a route it is the length of the agent's path.
+    They are measured along the route that an agent follows, and beyond its end along the path of the log, where the
+    log goes on from there. A route that passes a place twice is followed in order
+    (:func:`symphony.geometry.polylines.stations_along`). Without a route they are the length of the agent's path; of
+    an agent that goes on where route and log end but the map does not the first two are NaN.
     """
     rows, within = saved.agents[evaluated], slice(saved.start, saved.last + 1)
     there = saved.there[..., evaluated].swapaxes(1, 2)
@@ -246,18 +258,15 @@ def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> Progress
     both = there & seen
     driven, compared = _length(path, there), _length(path, both)
     logged = np.broadcast_to(_length(log, seen), goal.shape).copy()
-    counts = np.diff(saved.routes.offsets)
-    has = np.append(counts > 1, False)[goal]
+    has = np.append(np.diff(saved.routes.offsets) > 1, False)[goal]
     if not has.any():
-        return Progress(driven, compared, logged)
+        return driven, compared, logged
     # Agents have routes of their own, so a route is that of one agent.
     pairs = dict(zip(goal[has].tolist(), has.nonzero()[1].tolist(), strict=True))
     who, number = list(pairs.values()), {route: k for k, route in enumerate(pairs)}
     which = [number[route] for route in goal[has].tolist()]
-    whole = [
-        _with_log(saved.routes[route][:, :2].astype(np.float64), log[agent], seen[agent])
-        for route, agent in pairs.items()
-    ]
+    routes = [saved.routes[route][:, :2].astype(np.float64) for route in pairs]
+    whole = [_with_log(route, log[agent], seen[agent]) for route, agent in zip(routes, who, strict=True)]
     most = max(map(len, whole))
     lines = np.stack([np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in whole])
     places = stations_along(lines[which], path[has], there[has])
@@ -271,7 +280,7 @@ def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> Progress
     if beyond.any():
         beyond[has] &= np.array([ends_inside(lanes.graph, line) for line in whole])[which]
         driven[beyond] = compared[beyond] = np.nan
-    return Progress(driven, compared, logged)
+    return driven, compared, logged
 
 
 def _with_log(route: Reals, log: Reals, seen: Bools) -> Reals:
@@ -298,27 +307,22 @@ def _advance(places: Reals, counted: Bools) -> Reals:
     return np.where(counted.any(1), places[row, last] - places[row, counted.argmax(1)], 0.0)
 
 
-class Comfort(NamedTuple):
-    """Motion of evaluated agents [K, T, M]; NaN where it is not known: m/s^2, m/s^3, m/s^2."""
+def comfort(saved: SavedRollouts, evaluated: Indices) -> tuple[Reals, Reals, Reals]:
+    """Return acceleration, jerk and lateral acceleration of evaluated agents [K, T, M], NaN where it is not known.
 
-    acceleration: Reals
-    jerk: Reals
-    lateral: Reals
-
-
-def comfort(saved: SavedRollouts, evaluated: Indices) -> Comfort:
-    """Differences of speed, of acceleration, and speed times yaw rate, over one step each, not smoothed."""
+    They are differences of speed and of acceleration, and speed times yaw rate, over one step each, not smoothed.
+    """
     state, dt = saved.state[:, :, evaluated].astype(np.float64), saved.segment.dt
     state = np.where(saved.there[:, :, evaluated][..., None], state, np.nan)
     speed, heading = state[..., 3], state[..., 2]
     acceleration = np.diff(speed, axis=1) / dt
     turn = (np.diff(heading, axis=1) + np.pi) % (2 * np.pi) - np.pi
     jerk = np.diff(acceleration, axis=1, prepend=np.nan) / dt
-    return Comfort(acceleration, jerk, 0.5 * (speed[:, 1:] + speed[:, :-1]) * turn / dt)
+    return acceleration, jerk, 0.5 * (speed[:, 1:] + speed[:, :-1]) * turn / dt
 
 
 def log_distance(saved: SavedRollouts, evaluated: Indices) -> tuple[Reals, Indices]:
-    """Metres from the log, summed over the steps at which there is one, and their number: both [K]."""
+    """Return the metres from the log, summed over the steps at which there is one, and their number: both [K]."""
     rows, within = saved.agents[evaluated], slice(saved.start + 1, saved.last + 1)
     log = saved.segment.position[rows, within, :2].swapaxes(0, 1)
     both = saved.counted[:, :, evaluated] & saved.segment.valid[rows, within].T

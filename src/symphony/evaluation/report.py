@@ -5,11 +5,9 @@ A run is one rollout of one segment. Percent, metres, seconds; what each number 
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -18,143 +16,71 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import AgentType
 from symphony.errors import DataError
-from symphony.evaluation.contacts import contacts, time_to_collision
-from symphony.evaluation.driving import (
-    Lights,
-    blocking,
-    comfort,
-    log_distance,
-    progress,
-    red_lights,
-    wrong_way,
-)
-from symphony.evaluation.fault import at_fault
-from symphony.evaluation.lanes import Lanes
+from symphony.evaluation import driving
+from symphony.evaluation.contacts import Contacts, at_fault, contacts, time_to_collision
 from symphony.metrics import CollisionKind
-from symphony.metrics.intervals import ratio, zero_bound
+from symphony.metrics.intervals import grouped_mean, zero_bound
 from symphony.render.viewer import Event
 from symphony.saved.folder import RolloutFolder
 from symphony.saved.rollouts import SavedRollouts, world_of
 
 Evaluated = Literal["interactive", "ego"]
 Row = dict[str, Any]
+Array = NDArray[Any]
 
 LOW_TTC = 1.0
 """Seconds to a collision below which time counts as spent too near to one."""
 KIND_NAMES = {kind: kind.name.lower().replace("_", " ") for kind in CollisionKind}
-_NUMBERS = (
-    "collision",
-    "collision_at_states",
-    "at_fault_collision",
-    "collisions",
-    "red_lights",
-    "offroad_time",
-    "wrong_way_time",
-    "blocking_time",
-    "min_ttc",
-    "low_ttc_time",
-    "progress",
-    "progress_ratio",
-    "beyond_route",
-    "no_route",
-    "max_acceleration",
-    "max_braking",
-    "max_jerk",
-    "max_lateral_acceleration",
-    "log_distance",
-    "first_event",
-    "steps",
-    "logged_steps",
-)
-"""Numbers of a run; None for one that is not defined."""
-_WORST = (
-    "at_fault_collision",
-    "collision",
-    "red_lights",
-    "offroad_time",
-    "wrong_way_time",
-    "blocking_time",
-    "low_ttc_time",
-)
+_MOTION = ("max_acceleration", "max_braking", "max_jerk", "max_lateral_acceleration")
+_TIMES = ("offroad_time", "wrong_way_time", "blocking_time", "low_ttc_time")
+_WORST = ("at_fault_collision", "collision", "red_lights", *_TIMES)
 """What makes a run that did not fail a bad one, worst first."""
-_MEANS = {
+_OTHERS = ("min_ttc", "progress", "progress_ratio", "beyond_route", "no_route", "log_distance", "first_event")
+NUMBERS = (*_WORST, *_MOTION, *_OTHERS, "collision_at_states", "collisions", "steps", "logged_steps")
+"""Numbers of a run; None for one that is not defined."""
+_MARKS = {"offroad": ("leaves the road", "off road"), "blocking": ("blocks traffic", "blocks traffic")}
+"""What is marked where a flag of an agent is raised: text and label."""
+_MEANS: dict[str, tuple[str, float, str | None]] = {
     "collision_rate": ("collision", 100.0, None),
     "collision_rate_at_states": ("collision_at_states", 100.0, None),
     "at_fault_collision_rate": ("at_fault_collision", 100.0, None),
     "red_light_rate": ("red_lights", 100.0, None),
-    "offroad_time": ("offroad_time", 1.0, "steps"),
-    "wrong_way_time": ("wrong_way_time", 1.0, "steps"),
-    "blocking_time": ("blocking_time", 1.0, "steps"),
-    "low_ttc_time": ("low_ttc_time", 1.0, "steps"),
+    **{name: (name, 1.0, "steps") for name in _TIMES},
     "progress": ("progress", 1.0, None),
     "progress_ratio": ("progress_ratio", 1.0, None),
     "log_distance": ("log_distance", 1.0, "logged_steps"),
-    "mean_max_jerk": ("max_jerk", 1.0, None),
-    "mean_max_acceleration": ("max_acceleration", 1.0, None),
-    "mean_max_braking": ("max_braking", 1.0, None),
-    "mean_max_lateral_acceleration": ("max_lateral_acceleration", 1.0, None),
+    **{f"mean_{name}": (name, 1.0, None) for name in _MOTION},
 }
 """Means over runs: of which number, times what, weighted by what."""
 
 
 @dataclass
 class Report:
-    """What was found in a folder of rollouts.
-
-    Attributes:
-        agent: name of what was evaluated.
-        evaluated: which driven agents: all interactive ones, or the ego.
-        rows: one for each run, in the order of segments and rollouts.
-        collisions: how many there were, by kind, type of the other, fault, and whether the other played back the log.
-        events: of each segment, to be marked in its replay.
-    """
+    """What was found in a folder of rollouts."""
 
     agent: str
-    evaluated: Evaluated
-    rows: list[Row] = field(default_factory=list)
+    evaluated: Evaluated  # which driven agents: all interactive ones, or the ego
+    rows: list[Row] = field(default_factory=list)  # of each run, in the order of segments and rollouts
     collisions: Counter[tuple[str, str, bool, bool]] = field(default_factory=Counter)
-    events: dict[str, list[Event]] = field(default_factory=dict)
+    """By kind, type of the other, fault, and whether the other played back the log."""
+    events: dict[str, list[Event]] = field(default_factory=dict)  # of each segment, marked in its replay
 
     def worst(self) -> list[Row]:
-        """The runs, worst first; equal ones in their order."""
-
-        def badness(row: Row) -> list[float]:
-            return [-float(bool(row["failed"])), *(-_known(row[name]) for name in _WORST)]
-
-        return sorted(self.rows, key=badness)
-
-    def breakdown(self) -> list[Row]:
-        """Collisions by kind and so on, most frequent first."""
-        names = ("kind", "other", "at_fault", "with_playback")
-        return [
-            dict(zip(names, key, strict=True)) | {"collisions": n} for key, n in self.collisions.most_common()
-        ]
+        """Return the runs, worst first; equal ones in their order."""
+        return sorted(
+            self.rows, key=lambda row: [-bool(row["failed"]), *(-(row[name] or 0.0) for name in _WORST)]
+        )
 
     def totals(self) -> Row:
-        """Numbers of all runs, see :func:`total_numbers`."""
+        """Return the numbers of all runs, see :func:`total_numbers`."""
         return total_numbers(self.rows)
 
     def plain(self) -> Row:
-        """All of it, as JSON can hold it."""
-        units = {"rates and times": "percent", "lengths": "m", "durations": "s", "motion": "m/s^2, m/s^3"}
-        about = {"agent": self.agent, "evaluated": self.evaluated, "units": units}
-        return about | self.totals() | {"collisions": self.breakdown(), "per_run": self.worst()}
-
-    def csv(self) -> str:
-        """The rows, worst first; words that begin like a formula get an apostrophe, so no spreadsheet runs them."""
-        out = io.StringIO()
-        writer = csv.DictWriter(
-            out, ("segment", "rollout", "group", "failed", *_NUMBERS), lineterminator="\n"
-        )
-        writer.writeheader()
-        for row in self.worst():
-            formulas = {
-                name: f"'{value}"
-                for name, value in row.items()
-                if isinstance(value, str) and value.startswith(("=", "+", "-", "@"))
-            }
-            writer.writerow(row | formulas)
-        return out.getvalue()
+        """Return all of it, as JSON can hold it; collisions by kind and so on, most frequent first."""
+        names = ("kind", "other", "at_fault", "with_playback", "collisions")
+        kinds = [dict(zip(names, (*key, count), strict=True)) for key, count in self.collisions.most_common()]
+        about = {"agent": self.agent, "evaluated": self.evaluated}
+        return about | self.totals() | {"collisions": kinds, "per_run": self.worst()}
 
 
 def report(
@@ -166,11 +92,8 @@ def report(
 
     Args:
         folder: the rollouts.
-        evaluated: which of the driven agents.
+        evaluated: which of the driven agents; a DataError says that the ego is none of them.
         progress_bar: called with the segments done and their total.
-
-    Raises:
-        DataError: a segment can't be read, or its ego was not driven but is to be evaluated.
     """
     found = Report(folder.about.agent, evaluated)
     for number, saved in enumerate(folder):
@@ -178,163 +101,132 @@ def report(
         if progress_bar is not None:
             progress_bar(number + 1, len(folder))
     for lost in folder.failures:
-        name, group, reason = lost.segment, lost.group or lost.segment, lost.failed or "failed"
-        for k in range(lost.rollouts):
-            run = {"segment": name, "rollout": k, "group": group, "failed": reason}
-            found.rows.append(run | dict.fromkeys(_NUMBERS))
+        about = {"segment": lost.segment, "group": lost.group or lost.segment, "failed": lost.failed}
+        found.rows += [dict.fromkeys(NUMBERS) | about | {"rollout": k} for k in range(lost.rollouts)]
     return found
 
 
 def add_segment(found: Report, saved: SavedRollouts) -> None:
     """Evaluate the rollouts of one segment and add them to a report."""
-    segment, who = saved.segment, saved.evaluated
-    name = segment.segment_id
+    segment, who, name = saved.segment, saved.evaluated, saved.segment.segment_id
     if found.evaluated == "ego":
         who = np.flatnonzero(saved.agents == segment.ego)
         if not len(who):
             raise DataError("the ego was not driven", segment=name, field="agents")
-    numbers, events = _numbers(saved, who)
-    for k, values in enumerate(numbers):
-        run = {
-            "segment": name,
-            "rollout": k,
-            "group": segment.group or name,
-            "failed": saved.failed.get(k, ""),
-        }
-        found.rows.append(run | values)
-    for hit in (event for event in events if event.kind == "collision" and event.rollout not in saved.failed):
-        other = AgentType(segment.agent_type[hit.other]).name.lower()
-        found.collisions[hit.text, other, bool(hit.fault), hit.other not in saved.agents] += 1
-    found.events[name] = events
-
-
-def _numbers(saved: SavedRollouts, who: NDArray[np.int64]) -> tuple[list[Row], list[Event]]:
-    """Numbers of every rollout, and what is to be marked in them."""
-    segment, rows, lanes = saved.segment, saved.agents[who], Lanes(saved.segment)
-    moved, motion = progress(saved, who, lanes), comfort(saved, who)
-    distance, logged = log_distance(saved, who)
-    out, events = [], []
+    rows, lanes, events = saved.agents[who], driving.Lanes(segment), list[Event]()
+    driven, compared, of_log = driving.progress(saved, who, lanes)
+    acceleration, jerk, lateral = driving.comfort(saved, who)
+    distance, logged = driving.log_distance(saved, who)
     worlds = [world_of(saved, k) for k in range(saved.rollouts)]
     for k, (world, hits) in enumerate(zip(worlds, contacts(worlds, rows), strict=True)):
         counted = saved.counted[k][:, who].T
         off, stands = np.zeros((2, *world.valid.shape), bool)
         off[saved.agents, 1:] = (saved.offroad[k] & saved.counted[k]).T
-        lights = red_lights(world, np.union1d(rows, hits.other), lanes, saved.start)
+        stands[rows] = driving.blocking(world, rows, lanes, saved.start)
+        lights = driving.red_lights(world, np.union1d(rows, hits.other), lanes, saved.start)
         fault = at_fault(world, hits, lanes, off, lights)
         # Those of others only say whose fault a collision is.
-        lights = Lights(*(part[np.isin(lights.agent, rows)] for part in lights))
-        stands[rows] = blocking(world, rows, lanes, saved.start)
-        found = [
-            Event(k, step, agent, "collision", KIND_NAMES[CollisionKind(kind)], other, mine, "collision")
-            for agent, other, step, kind, mine in _each(hits.agent, hits.other, hits.step, hits.kind, fault)
-        ]
-        found += [
-            Event(k, step, agent, "redlight", "runs a red light", label="red light")
-            for agent, step in _each(lights.agent, lights.step)
-        ]
-        for flags, kind, text, label in (
-            (off, "offroad", "leaves the road", "off road"),
-            (stands, "blocking", "blocks traffic", "blocks traffic"),
-        ):
-            begins = flags[rows] & ~np.pad(flags[rows][:, :-1], ((0, 0), (1, 0)))
-            found += [
-                Event(k, step, int(rows[m]), kind, text, label=label) for m, step in _each(*begins.nonzero())
-            ]
-        found.sort(key=lambda event: event.step)
-        events += found
+        lights = driving.Lights(*(part[np.isin(lights.agent, rows)] for part in lights))
+        marked = _events(k, hits, fault, lights, rows, {"offroad": off, "blocking": stands})
         ttc = np.where(counted, time_to_collision(world, rows)[:, 1:], math.inf)
         steps = int(counted.sum())
         lane_steps = steps * (len(lanes.graph.usable_lanes) > 0)
         # Of an agent whose progress is not defined, the log's does not count either.
-        known = np.isfinite(moved.driven[k])
-        of_log = float(moved.logged[k][known].sum())
-        out.append(
-            {
-                "collision": len(hits.agent) > 0,
-                "collision_at_states": bool(hits.at_state.any()),
-                "at_fault_collision": bool(fault.any()),
-                "collisions": len(hits.agent),
-                "red_lights": len(lights.agent) if len(segment.signal_lane) else None,
-                "offroad_time": _percent(off[rows], steps * (len(segment.road.boundary) > 0)),
-                "wrong_way_time": _percent(wrong_way(world, rows, lanes)[:, 1:] & counted, lane_steps),
-                "blocking_time": _percent(stands[rows, 1:] & counted, lane_steps),
-                "min_ttc": _most(-ttc, -1.0),
-                "low_ttc_time": _percent(ttc < LOW_TTC, steps),
-                "progress": float(moved.driven[k][known].mean()) if known.any() else None,
-                "progress_ratio": float(moved.compared[k][known].sum()) / of_log if of_log > 1 else None,
-                "beyond_route": int((~known).sum()),
-                "no_route": int((saved.goal[k, who] < 0).sum()),
-                "max_acceleration": _most(motion.acceleration[k]),
-                "max_braking": _most(-motion.acceleration[k]),
-                "max_jerk": _most(np.abs(motion.jerk[k])),
-                "max_lateral_acceleration": _most(np.abs(motion.lateral[k])),
-                "log_distance": float(distance[k] / logged[k]) if logged[k] else None,
-                "first_event": round(found[0].step * segment.dt, 3) if found else None,
-                "steps": steps,
-                "logged_steps": int(logged[k]),
-            }
-        )
-    return out, events
+        known = np.isfinite(driven[k])
+        whole = float(of_log[k][known].sum())
+        numbers: Row = {
+            "segment": name,
+            "rollout": k,
+            "group": segment.group or name,
+            "failed": saved.failed.get(k, ""),
+            "collision": len(hits.agent) > 0,
+            "collision_at_states": bool(hits.at_state.any()),
+            "at_fault_collision": bool(fault.any()),
+            "collisions": len(hits.agent),
+            "red_lights": len(lights.agent) if len(segment.signal_lane) else None,
+            "offroad_time": _percent(off[rows], steps * (len(segment.road.boundary) > 0)),
+            "wrong_way_time": _percent(driving.wrong_way(world, rows, lanes)[:, 1:] & counted, lane_steps),
+            "blocking_time": _percent(stands[rows, 1:] & counted, lane_steps),
+            "min_ttc": _most(-ttc, -1.0),
+            "low_ttc_time": _percent(ttc < LOW_TTC, steps),
+            "progress": float(driven[k][known].mean()) if known.any() else None,
+            "progress_ratio": float(compared[k][known].sum()) / whole if whole > 1 else None,
+            "beyond_route": int((~known).sum()),
+            "no_route": int((saved.goal[k, who] < 0).sum()),
+            "max_acceleration": _most(acceleration[k]),
+            "max_braking": _most(-acceleration[k]),
+            "max_jerk": _most(np.abs(jerk[k])),
+            "max_lateral_acceleration": _most(np.abs(lateral[k])),
+            "log_distance": float(distance[k] / logged[k]) if logged[k] else None,
+            "first_event": round(marked[0].step * segment.dt, 3) if marked else None,
+            "steps": steps,
+            "logged_steps": int(logged[k]),
+        }
+        found.rows.append(numbers)
+        events += marked
+        for hit in (event for event in marked if event.kind == "collision" and k not in saved.failed):
+            other = AgentType(segment.agent_type[hit.other]).name.lower()
+            found.collisions[hit.text, other, bool(hit.fault), hit.other not in saved.agents] += 1
+    found.events[name] = events
 
 
-def _each(*parts: NDArray[Any]) -> Any:
+def _events(
+    k: int, hits: Contacts, fault: Array, lights: driving.Lights, rows: Array, flags: Mapping[str, Array]
+) -> list[Event]:
+    """What is to be marked in the replay of a rollout, by time."""
+    found = [
+        Event(k, step, agent, "collision", KIND_NAMES[CollisionKind(kind)], other, mine, "collision")
+        for agent, other, step, kind, mine in _each(hits.agent, hits.other, hits.step, hits.kind, fault)
+    ]
+    for agent, step in _each(lights.agent, lights.step):
+        found.append(Event(k, step, agent, "redlight", "runs a red light", label="red light"))
+    for kind, flag in flags.items():
+        begins = flag[rows] & ~np.pad(flag[rows][:, :-1], ((0, 0), (1, 0)))
+        for m, step in _each(*begins.nonzero()):
+            found.append(Event(k, step, int(rows[m]), kind, _MARKS[kind][0], label=_MARKS[kind][1]))
+    return sorted(found, key=lambda event: event.step)
+
+
+def _each(*parts: Array) -> Any:
     return zip(*(part.tolist() for part in parts), strict=True)
 
 
-def _percent(flags: NDArray[np.bool_], whole: int) -> float | None:
+def _percent(flags: Array, whole: int) -> float | None:
     return 100.0 * float(flags.sum()) / whole if whole else None
 
 
-def _most(values: NDArray[np.float64], sign: float = 1.0) -> float | None:
+def _most(values: Array, sign: float = 1.0) -> float | None:
     """The largest finite value, times a sign; None without any."""
     known = values[np.isfinite(values)]
     return sign * float(known.max()) + 0.0 if len(known) else None
 
 
-def _known(value: Any) -> float:
-    return 0.0 if value is None else float(value)
-
-
 def total_numbers(rows: Sequence[Row]) -> Row:
-    """Totals of some runs.
+    """Return the totals of some runs.
 
     Returns:
         ``runs`` (failed ones included), ``failed_runs``, ``segments`` and ``groups``; over the runs that did not fail
-        the means, each with its standard error over groups under ``*_se`` (None for a single group) and the segments
-        that have such a number under ``*_segments``; the largest ``max_*`` and the smallest ``min_ttc``. ``*_rate``
-        are percent of runs (``collision_rate_at_states``: at states only), ``*_time`` percent of the evaluated
-        agents' time, ``log_distance`` is a mean over steps. ``*_bound`` is of a percentage that is zero the exact
-        bound over groups with 95 % confidence (:func:`symphony.metrics.intervals.zero_bound`), else None.
+        the means (``*_rate`` in percent of runs, ``*_time`` in percent of the evaluated agents' time), each with its
+        standard error over groups under ``*_se`` (None for a single group), the segments that have such a number
+        under ``*_segments`` and, of a percentage that is zero, its exact bound over groups under ``*_bound`` (see
+        :func:`symphony.metrics.intervals.zero_bound`); the largest ``max_*`` and the least ``min_ttc``.
     """
     good = [row for row in rows if not row["failed"]]
     names, member = np.unique([row["group"] for row in good], return_inverse=True)
-    out: Row = {
-        "runs": len(rows),
-        "failed_runs": len(rows) - len(good),
-        "segments": len({row["segment"] for row in rows}),
-        "groups": len(names),
-    }
+    out: Row = {"runs": len(rows), "failed_runs": len(rows) - len(good)}
+    out |= {"segments": len({row["segment"] for row in rows}), "groups": len(names)}
     for name, (of, scale, by) in _MEANS.items():
-        value = np.array([_known(row[of]) for row in good], np.float64)
-        if of == "red_lights":
-            value = (value > 0).astype(np.float64)
+        value = np.array(
+            [bool(row[of]) if of == "red_lights" else row[of] or 0.0 for row in good], np.float64
+        )
         weight = np.array(
-            [0.0 if row[of] is None else 1.0 if by is None else row[by] for row in good], np.float64
+            [(1.0 if by is None else row[by]) * (row[of] is not None) for row in good], np.float64
         )
         out[name], out[f"{name}_se"] = grouped_mean(scale * value, weight, member)
         has = weight > 0
         out[f"{name}_segments"] = len({row["segment"] for row, some in zip(good, has, strict=True) if some})
         if name.endswith(("_rate", "_time", "_states")):
             out[f"{name}_bound"] = zero_bound(len(np.unique(member[has]))) if out[name] == 0 else None
-    for name in ("max_acceleration", "max_braking", "max_jerk", "max_lateral_acceleration"):
-        out[name] = max((row[name] for row in good if row[name] is not None), default=None)
-    out["min_ttc"] = min((row["min_ttc"] for row in good if row["min_ttc"] is not None), default=None)
+    for name, most in {**dict.fromkeys(_MOTION, max), "min_ttc": min}.items():
+        out[name] = most((row[name] for row in good if row[name] is not None), default=None)
     return out
-
-
-def grouped_mean(
-    value: NDArray[np.float64], weight: NDArray[np.float64], member: NDArray[np.int64]
-) -> tuple[float | None, float | None]:
-    """Weighted mean and standard error over groups (:func:`symphony.metrics.intervals.ratio`); None for NaN."""
-    mean, error = ratio(value * weight, weight, member)
-    return None if math.isnan(mean) else mean, None if math.isnan(error) else error

@@ -5,399 +5,247 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
+from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, get_args
 
-from symphony.config import EvaluateConfig, Method, PaperData, Setting, TableColumns
-from symphony.errors import ConfigError, DataError
-from symphony.evaluation.paper import METRICS, paper_figures
-from symphony.evaluation.records import (
-    choose_evaluation,
-    find_runs,
-    fitting,
-    kept_evaluations,
-    read_run,
-    run_interactive,
-    simulation_way,
-    updates_done,
-)
+import numpy as np
 
-BASELINES = {"playback": "Playback", "constant_velocity": "Constant velocity"}
-"""Rows that every table begins with."""
+from symphony.config import Method, PaperData, Setting
+from symphony.errors import ConfigError, DataError
+from symphony.evaluation import records
+
+BASELINES = {"playback": "Playback", "constant_velocity": "Constant velocity"}  # every table begins with them
 ROWS: tuple[str, ...] = (*BASELINES, *get_args(Method))
 SETTINGS: dict[Setting, tuple[int, int]] = {"main": (2, 10), "long": (2, 20), "many": (8, 10)}
 """Interactive agents and seconds."""
-AT_STATES = "collision_rate_at_states"
-"""The paper's reading of collisions; records from before it had a name have no other."""
-WHOLE_LOG = 10
-"""Seconds that the whole of the segments counts as, where nothing says how many they are."""
+WHOLE_LOG = 10  # seconds of a run that was trained on the whole of its segments
+METRICS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
+"""The paper's; collisions are those at states only, as the paper counts them."""
 _TRAFFIC = ("interactive", "others", "open_traffic", "radius")
 """Settings of an evaluation that decide what agents meet: rows of a table share them."""
-_FREE = (
-    "seed",
-    "data",
-    "validation.data",
-    "out",
-    "warm_start",
-    "resume",
-    "device",
-    "wandb",
-    "checkpoint_every",
-    "log_every",
-)
-"""What may differ between runs of one method: which seed, where things lie, how it was run."""
-_AT_A_DISTANCE = ("ade", "min_sade", "curvature_jsd", "curvature_jsd_floor", "curvature_jsd_corrected")
-"""Distances from the log, of which the log itself has none."""
-
-
-# --- which evaluations count ---
+_FREE = ("seed", "data", "validation", "out", "warm_start", "resume", "device", "wandb")
+"""What may differ between runs of one method: which seed, where things lie."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A run and the evaluation that stands for it, or one of several by the way it was simulated.
-
-    Attributes:
-        folder: of the run.
-        config: of the run.
-        name: of the evaluation.
-        record: the evaluation.
-        way: how it was simulated, where a run has a row for each way.
-    """
+    """A run, by its folder and configuration, and one of its evaluations, by its name and record."""
 
     folder: Path
     config: Mapping[str, Any]
     name: str
     record: Mapping[str, Any]
-    way: str = ""
 
     @property
     def method(self) -> str:
-        """The row that the run belongs to."""
+        """The method of the run."""
         return self.config["method"]
+
+    @property
+    def way(self) -> str:
+        """How the run was simulated."""
+        return records.simulation_way(self.record["config"])
 
     @property
     def seed(self) -> int:
         """The seed of the training."""
         return self.config.get("seed", 0)
 
+    def number(self, key: str, where: Mapping[str, Any] | None = None) -> float:
+        """Return a number of the record, or of a part of it; NaN for a mean over nothing.
+
+        Raises:
+            DataError: it is no number.
+        """
+        where = self.record if where is None else where
+        if key == "cost":
+            return where[key]["simulation"] / max(1, where["segments"])
+        value = where.get("collision_rate_at_states" if key == "collision_rate" else key, "")
+        if value is None:  # JSON has no NaN
+            return math.nan
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise DataError("is no number", file=str(self), field=key)
+        return float(value)
+
+    def baseline(self, name: str, key: str) -> float:
+        """Return a number of a baseline; NaN where it has none, as the log has no distance from itself."""
+        known = key in self.record[name] and not (name == "playback" and key in DISTANCES)
+        return self.number(key, self.record[name]) if known else math.nan
+
     def __str__(self) -> str:
         return f"{self.folder} ({self.name})"
 
 
 def method_name(method: str) -> str:
-    """A method as the paper writes it, such as BC+TS+H."""
+    """Return a method as the paper writes it, such as BC+TS+H."""
     return BASELINES.get(method) or method.upper().replace("_", "+")
 
 
-def family(method: str) -> str:
-    """Methods that compete for the best value: ``bc`` or ``mgail``."""
-    return method.partition("_")[0]
-
-
 def collect(
-    folders: Sequence[Path], setting: Setting, patterns: Sequence[str] = (), *, each: bool = False
+    folders: Sequence[Path], setting: Setting, patterns: Sequence[str] = ()
 ) -> tuple[list[Entry], dict[str, list[Path]]]:
-    """The evaluated runs of a setting.
+    """Return the evaluated runs of a setting, and the runs that are left out by the reason.
 
     Args:
         folders: runs, or folders of runs.
         setting: of the runs that are wanted.
-        patterns: names of evaluations (``*`` and ``?`` stand for anything); of those of a run, the ones that the
-            first fitting pattern fits count. Without patterns all do.
-        each: take every evaluation that any pattern fits, as a row for each way of simulation.
-
-    Returns:
-        The runs, each with its one evaluation (or with each), and those that are left out by the reason.
+        patterns: names of evaluations; those that the first fitting one fits count (``*`` is anything).
 
     Raises:
-        ConfigError: no runs, a run with several evaluations, or two runs of the same method and seed.
-        DataError: a file that can't be read.
+        ConfigError: no runs, or two evaluations of one method, seed and way to simulate.
+        DataError: a file can't be read.
     """
-    entries: list[Entry] = []
+    entries: dict[tuple[str, str, int], Entry] = {}
     left_out: dict[str, list[Path]] = {}
     interactive, seconds = SETTINGS[setting]
-    for folder in find_runs(folders):
-        config, kept, reason = read_run(folder), {}, ""
-        acting, lasting = run_interactive(config), config.get("duration", 0)
-        if config["method"] not in ROWS[1:]:
+    for folder in records.find_runs(folders):
+        config, kept, names = records.read_run(folder), records.kept_evaluations(folder), list[str]()
+        acting, lasting = config.get("agent", {}).get("interactive", 2), config.get("duration", 0)
+        if config["method"] not in get_args(Method):
             reason = f"unknown method {config['method']}"
         elif acting != interactive or lasting not in (0, seconds):
             reason = f"trained with {acting} interactive agents for {lasting or WHOLE_LOG:g} s"
         else:
-            kept = {
-                name: record
-                for name, record in kept_evaluations(folder).items()
-                if record["config"]["interactive"] == interactive
-                and setting_seconds(record) == seconds
-                and record["config"]["duration"] in (0, config.get("duration") or WHOLE_LOG)
+            wanted = {(interactive, duration) for duration in (0, lasting or WHOLE_LOG)}
+            how = {
+                name: (one["config"]["interactive"], one["config"]["duration"]) for name, one in kept.items()
             }
-            if not kept:
-                reason = "not evaluated (symphony evaluate RUN --data DIR)"
-            elif not fitting(kept, patterns):
-                reason = "only evaluated in other ways"
-        if reason:
+            kept = {n: one for n, one in kept.items() if how[n] in wanted and setting_seconds(one) == seconds}
+            names = records.fitting(kept, patterns)
+            reason = "only evaluated in other ways" if kept else "not evaluated by symphony evaluate"
+        if not names:
             left_out.setdefault(reason, []).append(folder)
-        elif each:
-            names = [name for name in kept if any(fnmatchcase(name, pattern) for pattern in patterns or "*")]
-            entries += [Entry(folder, config, n, kept[n], simulation_way(kept[n]["config"])) for n in names]
-        else:
-            entries.append(Entry(folder, config, *choose_evaluation(folder, kept, patterns)))
-    seen: dict[tuple[str, int, str], Entry] = {}
-    for entry in entries:
-        other = seen.setdefault((entry.method, entry.seed, entry.way), entry)
-        if other.folder != entry.folder:
-            raise ConfigError(
-                f"two runs of {method_name(entry.method)} with seed {entry.seed}: {other.folder}, {entry.folder}"
-            )
-        if other is not entry:
-            raise ConfigError(
-                f"{entry.folder} was simulated twice as {entry.way}, choose with --evaluation: {other.name}, "
-                f"{entry.name}"
-            )
-    return entries, left_out
+        for name in names:
+            entry = Entry(folder, config, name, kept[name])
+            other = entries.setdefault((entry.method, entry.way, entry.seed), entry)
+            if other is not entry:
+                what = f"{method_name(entry.method)} with seed {entry.seed} was simulated twice"
+                raise ConfigError(f"{what} as {entry.way}, choose with --evaluation: {other}, {entry}")
+    return list(entries.values()), left_out
 
 
 def setting_seconds(record: Mapping[str, Any]) -> float:
-    """Seconds of the setting that an evaluation belongs to.
-
-    Those asked for; of one over the whole of the segments those of the setting that is nearest to its horizon: logs
-    of 9.1 s belong to the one of 10.
-    """
-    horizon: float = record.get("horizon", WHOLE_LOG)
-    nearest = min((seconds for _, seconds in SETTINGS.values()), key=lambda seconds: abs(seconds - horizon))
-    return record["config"]["duration"] or nearest
-
-
-def number(entry: Entry, where: Mapping[str, Any], key: str) -> float:
-    """A number of an evaluation, from its record or a part of it; NaN for a mean over nothing.
-
-    Collisions are those at states only, as the paper and all evaluations of before count them.
-
-    Raises:
-        DataError: it is none.
-    """
-    value = where.get(AT_STATES, where.get(key, "")) if key == "collision_rate" else where.get(key, "")
-    # JSON has no NaN, which stands for a mean over nothing.
-    if value is None:
-        return math.nan
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise DataError("is no number", file=f"{entry.folder}: {entry.name}", field=key)
-    return float(value)
-
-
-# --- numbers ---
+    """Return the seconds of the setting of an evaluation: those asked for, or the nearest to its whole segments."""
+    away = {seconds: abs(seconds - record.get("horizon", WHOLE_LOG)) for _, seconds in SETTINGS.values()}
+    return record["config"]["duration"] or min(away, key=away.__getitem__)
 
 
 @dataclass(frozen=True)
 class Column:
-    """A metric as it is shown: times ``scale``, with ``digits`` after the point.
+    """A metric as it is shown: times ``scale``, with ``digits`` after the point."""
 
-    Attributes:
-        key: its name in a record; that of a difference where ``less`` says of which two.
-        title: its heading.
-        unit: after scaling.
-        scale: what it is multiplied with.
-        digits: after the point.
-        optional: not all records have it; where it is absent there is no number.
-        less: names of the metric it begins with and of the one that is taken away.
-    """
-
-    key: str
     title: str
     unit: str
-    scale: float = 1.0
     digits: int = 2
-    optional: bool = False
-    less: tuple[str, str] | None = None
+    scale: float = 1.0
 
     def shown(self, value: float) -> str:
-        """The value as text."""
+        """Return the value as text."""
         return f"{value * self.scale:.{self.digits}f}"
 
 
-COLUMNS = (
-    Column("collision_rate", "collision", "%"),
-    Column("offroad_time", "off-road", "%"),
-    Column("ade", "ADE", "m"),
-    Column("min_sade", "minSADE", "m"),
-    Column("curvature_jsd", "curvature JSD", "10⁻³", 1000.0),
-)
-"""In the paper's order and units."""
-WOSAC = (
-    Column("wosac_metametric", "WOSAC", "", digits=3, optional=True),
-    Column("wosac_kinematic_metrics", "kinematic", "", digits=3, optional=True),
-    Column("wosac_interactive_metrics", "interactive", "", digits=3, optional=True),
-    Column("wosac_map_based_metrics", "map", "", digits=3, optional=True),
-    Column("wosac_min_ade", "minADE", "m", optional=True),
-)
-"""Of evaluations with `--metrics wosac`; the metametric and the three means of its components, 0 to 1."""
-COST = Column("cost", "CPU", "s/segment")
-"""CPU time of the simulation of all rollouts of a segment."""
-FLOOR = Column("curvature_jsd_floor", "JSD floor", "10⁻³", 1000.0, optional=True)
-"""What the finite size of the log alone gives, beside the divergence."""
-_SPLIT = ("collision_rate", "collision_with_playback")
-ASKED: dict[TableColumns, tuple[Column, ...]] = {
-    "split": (
-        Column("collision_with_playback", "with playback", "%", optional=True),
-        Column("collision_with_agents", "the rest", "%", optional=True, less=_SPLIT),
-    ),
-    "standing": (
-        Column("standing", "standing", "%", digits=1, optional=True),
-        Column("standing_log", "in the log", "%", digits=1, optional=True),
-    ),
-    "corrected": (Column("curvature_jsd_corrected", "JSD corrected", "10⁻³", 1000.0, optional=True),),
-    "goals": (
-        Column("goals_turn_variation", "turns moved", "TV", optional=True),
-        Column("goals_variation", "goals moved", "TV", optional=True),
-        Column("goals_founders", "first branches", "left", digits=1, optional=True),
-    ),
+COLUMNS = {
+    "collision_rate": Column("collision", "%"),
+    "offroad_time": Column("off-road", "%"),
+    "ade": Column("ADE", "m"),
+    "min_sade": Column("minSADE", "m"),
+    "curvature_jsd": Column("curvature JSD", "10⁻³", 2, 1000.0),
+    "curvature_jsd_floor": Column("JSD floor", "10⁻³", 2, 1000.0),
+    "wosac_metametric": Column("WOSAC", "", 3),
+    "wosac_kinematic_metrics": Column("kinematic", "", 3),
+    "wosac_interactive_metrics": Column("interactive", "", 3),
+    "wosac_map_based_metrics": Column("map", "", 3),
+    "wosac_min_ade": Column("minADE", "m"),
+    "cost": Column("CPU", "s/segment"),
 }
-"""Columns on request."""
+"""By their keys in a record; metrics of a user's own, by import path, have none."""
+WOSAC = tuple(key for key in COLUMNS if key.startswith("wosac"))
+"""Of evaluations with `--metrics wosac`; the metametric and the three means of its components are 0 to 1."""
+DISTANCES = ("ade", "min_sade", "curvature_jsd", "curvature_jsd_floor")
+"""Distances from the log, of which the log itself has none."""
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One metric of one method.
+def paper_figures(setting: Setting, dataset: PaperData) -> dict[str, dict[str, tuple[float, float]]]:
+    """Return the paper's figures (Igl et al., ICRA 2022, tables I and II) by method and metric; empty if it has none.
 
-    Attributes:
-        values: of every seed.
-        mean: over them; NaN where one of them is.
-        error: standard error of the mean; NaN for a single seed.
-        best: whether no method of its family is better.
+    Each is a mean and its standard error, NaN where there is none; ``paper.csv`` has thousandths of a nat.
     """
-
-    values: tuple[float, ...] = ()
-    mean: float = math.nan
-    error: float = math.nan
-    best: bool = False
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> Cell:
-        """The cell of some seeds."""
-        count, mean = len(values), math.fsum(values) / len(values)
-        squares = math.fsum((value - mean) ** 2 for value in values)
-        error = math.sqrt(squares / (count - 1) / count) if count > 1 else math.nan
-        return cls(tuple(values), mean, error)
+    found = {}
+    for line in files("symphony.evaluation").joinpath("paper.csv").read_text().splitlines():
+        *of, method = (words := line.split(","))[:3]
+        if of == [setting, dataset]:
+            values = [float(word or "nan") for word in words[3:]]
+            values[-2:] = [value / 1000 for value in values[-2:]]
+            found[method] = dict(zip(METRICS, zip(values[::2], values[1::2], strict=True), strict=True))
+    return found
 
 
-ABSENT = Cell()
-
-
-@dataclass(frozen=True)
-class Row:
-    """A method, or one way of simulating it.
-
-    Attributes:
-        method: its name.
-        way: how it was simulated, where a method has a row for each way.
-        seeds: in ascending order.
-        evaluations: names of the evaluations of each seed.
-        cells: ours by metric.
-        paper: the paper's by metric.
-    """
-
-    method: str
-    way: str
-    seeds: tuple[int, ...]
-    evaluations: tuple[str, ...]
-    cells: Mapping[str, Cell]
-    paper: Mapping[str, Cell]
-
-    @property
-    def name(self) -> str:
-        """As in the paper, then the way."""
-        return " ".join(filter(None, (method_name(self.method), self.way)))
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A table of the paper from our runs.
-
-    Attributes:
-        setting: which of the paper's.
-        dataset: whose figures stand beside ours; None for none.
-        columns: the paper's metrics, metrics of the user's own, the cost.
-        rows: in the paper's order, of the methods there are.
-        notes: what else must be known to read it.
-    """
-
-    setting: Setting
-    dataset: PaperData | None
-    columns: tuple[Column, ...]
-    rows: tuple[Row, ...]
-    notes: tuple[str, ...]
-
-    @property
-    def title(self) -> str:
-        """The setting in words."""
-        interactive, seconds = SETTINGS[self.setting]
-        return f"{interactive} interactive agents, {seconds} s"
-
-
-def compare(
-    entries: Sequence[Entry],
-    setting: Setting,
-    dataset: PaperData | None = None,
-    asked: Sequence[TableColumns] = (),
-) -> Comparison:
-    """The table of some evaluated runs; their order does not matter.
+def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | None = None) -> dict[str, Any]:
+    """Return the table of some evaluated runs of a setting; their order does not matter.
 
     Args:
-        entries: the runs, of one method with one seed one for each way of simulation.
+        entries: the runs, of one method with one seed one for each way to simulate.
         setting: theirs.
-        dataset: whose figures from the paper stand beside ours.
-        asked: columns on request.
+        dataset: whose figures from the paper stand beside ours; only what the paper has stands beside them.
+
+    Returns:
+        As JSON can hold it: ``columns``, the metrics; ``rows`` in the paper's order, each with a cell for each metric
+        (``mean``, ``se`` over seeds, ``values``, and ``best``, whether no method of its family is better), the
+        paper's cells in ``paper``, and ``way`` where its method has a row for each way to simulate; ``notes``.
 
     Raises:
         ConfigError: no runs, runs evaluated on different segments or in other traffic, seeds of a method evaluated
             in different ways, or figures that the paper does not have.
-        DataError: an evaluation without a number that is needed.
+        DataError: an evaluation lacks a number that is needed.
     """
     figures = paper_figures(setting, dataset) if dataset else {}
-    if dataset is not None and not figures:
-        raise ConfigError(f"the paper has no figures for setting '{setting}' on {dataset}")
-    if not entries:
-        raise ConfigError(f"no evaluated runs of setting '{setting}'")
+    if not entries or (dataset is not None and not figures):
+        what = f"the paper has no figures for setting '{setting}' on {dataset}"
+        raise ConfigError(what if entries else f"no evaluated runs of setting '{setting}'")
     entries = sorted(entries, key=lambda entry: (ROWS.index(entry.method), entry.way, entry.seed))
     _check_comparable(entries)
-    columns = (*COLUMNS, *(column for name in dict.fromkeys(asked) for column in ASKED[name]))
-    if not figures:  # beside the paper's figures stand only what the paper has
-        floor = (FLOOR,) if all(FLOOR.key in entry.record for entry in entries) else ()
-        paths = [set(entry.record["config"].get("metric", ())) for entry in entries]
-        own = [
-            Column(path, path.rpartition(":")[2], "", digits=3) for path in sorted(set.intersection(*paths))
-        ]
-        wosac = WOSAC if _wosac_year(entries) else ()
-        columns = (*COLUMNS, *floor, *columns[len(COLUMNS) :], *wosac, *own, COST)
+    first, keys = entries[0], list(METRICS)
+    if not figures:
+        own = set.intersection(*(set(entry.record["config"]["metric"]) for entry in entries))
+        keys += ["curvature_jsd_floor", *(WOSAC if _wosac_year(entries) else ()), *sorted(own), "cost"]
     found: dict[tuple[str, str], list[Entry]] = {(name, ""): [] for name in BASELINES}
     for entry in entries:
         found.setdefault((entry.method, entry.way), []).append(entry)
-    theirs = _with_best(
-        {
-            (method, ""): {key: Cell((), *figure) for key, figure in row.items()}
-            for method, row in figures.items()
-        }
-    )
-    ours = _with_best(
-        {
-            name: {column.key: _cell(mine, column, name[0], entries[0]) for column in columns}
-            for name, mine in found.items()
-        }
-    )
-    rows = [
-        Row(
-            *name,
-            tuple(entry.seed for entry in mine),
-            tuple(entry.name for entry in mine),
-            ours[name],
-            theirs.get((name[0], ""), {}),
-        )
-        for name, mine in found.items()
-    ]
-    return Comparison(setting, dataset, columns, tuple(rows), tuple(_notes(entries, dataset)))
+    methods = [method for method, _ in found]
+    paper: dict[str, Any] = {method: {} for method in methods}
+    for method in paper.keys() & figures.keys():
+        paper[method] = {key: {"mean": mean, "se": error} for key, (mean, error) in figures[method].items()}
+    rows: list[dict[str, Any]] = []
+    for (method, way), mine in found.items():
+        row: dict[str, Any] = {"method": method, "way": way if methods.count(method) > 1 else ""}
+        row["name"] = f"{method_name(method)} {row['way']}".strip()
+        row |= {"seeds": [one.seed for one in mine], "evaluations": [one.name for one in mine]}
+        for key in keys:
+            row[key] = _cell([one.number(key) for one in mine] or [first.baseline(method, key)])
+        rows.append(row | {"paper": paper[method]})
+    _mark_best(rows)
+    _mark_best([{"method": method} | cells for method, cells in paper.items() if cells])
+    interactive, seconds = SETTINGS[setting]
+    about = {"setting": setting, "interactive": interactive, "duration": seconds, "paper": dataset}
+    return about | {"columns": keys, "rows": rows, "notes": _notes(entries, dataset)}
+
+
+def _cell(values: Sequence[float]) -> dict[str, Any]:
+    """The mean of some seeds, NaN where one of them is, and its standard error, NaN for a single seed."""
+    error = float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+    return {"mean": float(np.mean(values)), "se": error, "values": list(values)}
+
+
+def _mark_best(rows: Sequence[dict[str, Any]]) -> None:
+    """Mark the lowest of the paper's metrics of the BC and the MGAIL methods; what looks equal is equally good."""
+    for key in METRICS:
+        for row in rows:
+            family = [one for one in rows if one["method"].split("_")[0] == row["method"].split("_")[0]]
+            known = [one[key]["mean"] for one in family if not math.isnan(one[key]["mean"])]
+            shown = [COLUMNS[key].shown(value) for value in (row[key]["mean"], min(known, default=math.nan))]
+            row[key]["best"] = row["method"] not in BASELINES and len(known) > 1 and shown[0] == shown[1]
 
 
 def _wosac_year(entries: Sequence[Entry]) -> str | None:
@@ -408,65 +256,21 @@ def _wosac_year(entries: Sequence[Entry]) -> str | None:
     return None if None in years else years.pop()
 
 
-def _number(entry: Entry, column: Column, part: str = "") -> float:
-    if column.key == COST.key:
-        return float(entry.record["cost"]["simulation"]) / max(1, entry.record["segments"])
-    where = entry.record[part] if part else entry.record
-    if column.less is not None:
-        # Kinds are of all collisions, those between states included.
-        begin, taken = (where.get(key) for key in column.less)
-        return math.nan if begin is None or taken is None else float(begin) - float(taken)
-    return math.nan if column.optional and column.key not in where else number(entry, where, column.key)
-
-
-def _cell(mine: Sequence[Entry], column: Column, name: str, first: Entry) -> Cell:
-    """A metric of a method over its seeds; of a baseline what the first evaluation says of it."""
-    if mine:
-        return Cell.of([_number(entry, column) for entry in mine])
-    at_log = name == "playback" and column.key in _AT_A_DISTANCE
-    known = not at_log and (column.key in METRICS or column.optional)
-    return Cell.of([_number(first, column, name)]) if known else ABSENT
-
-
-def _with_best(
-    table: Mapping[tuple[str, str], Mapping[str, Cell]],
-) -> dict[tuple[str, str], dict[str, Cell]]:
-    """Mark the lowest value of the paper's metrics in each family of two methods or more.
-
-    What looks equal in the table is equally good.
-    """
-    done = {name: dict(cells) for name, cells in table.items()}
-    for column in COLUMNS:
-        for group in {family(method) for method, _ in table if method not in BASELINES}:
-            rivals = {name: table[name][column.key] for name in table if family(name[0]) == group}
-            known = [cell.mean for cell in rivals.values() if not math.isnan(cell.mean)]
-            for name, cell in rivals.items():
-                best = len(known) > 1 and column.shown(cell.mean) == column.shown(min(known))
-                done[name][column.key] = replace(cell, best=best)
-    return done
-
-
 def _check_comparable(entries: Sequence[Entry]) -> None:
-    first, defaults = entries[0], EvaluateConfig()
-    known: dict[tuple[str, str], Entry] = {}
+    first, known = entries[0], dict[tuple[str, str], Entry]()
     for entry in entries:
         both, other = (first, entry), known.setdefault((entry.method, entry.way), entry)
-        configs = [each.record["config"] for each in both]
-        differing = [
-            name
-            for name in _TRAFFIC
-            if len({config.get(name, getattr(defaults, name)) for config in configs}) > 1
-        ]
+        one, two = (each.record["config"] for each in both)
+        differing = [name for name in _TRAFFIC if one[name] != two[name]]
         # 0 seconds are all of a segment: whether those are as many, only what was found tells.
-        if configs[0]["duration"] != configs[1]["duration"]:
-            far = [number(each, each.record["constant_velocity"], "ade") for each in both]
-            differing += [] if math.isclose(*far, rel_tol=1e-3) else ["duration"]
-        ways = [each.record["config"] | {"seed": 0} for each in (other, entry)]
-        if first.record["data"].get("checksum") != entry.record["data"].get("checksum"):
+        far = [each.number("ade", each.record["constant_velocity"]) for each in both]
+        if one["duration"] != two["duration"] and not math.isclose(*far, rel_tol=1e-3):
+            differing.append("duration")
+        if first.record["data"]["checksum"] != entry.record["data"]["checksum"]:
             wrong = "evaluated on different run segments"
         elif differing:
             wrong = f"evaluated in other traffic ({', '.join(differing)})"
-        elif ways[0] != ways[1]:
+        elif other.record["config"] | {"seed": 0} != two | {"seed": 0}:
             wrong, both = f"seeds of {method_name(entry.method)} evaluated in different ways", (other, entry)
         else:
             continue
@@ -474,55 +278,70 @@ def _check_comparable(entries: Sequence[Entry]) -> None:
 
 
 def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
+    """What else must be known to read a table."""
     record = entries[0].record
     notes = [
-        f"{record['segments']} run segments of {record.get('groups', record['segments'])} recordings in "
-        f"{record['data']['name']} ({record['data']['checksum'][:12]}); ± standard error over seeds; bold: best of "
-        f"the BC methods and of the MGAIL methods"
+        f"{record['segments']} run segments in {record['data']['name']} ({record['data']['checksum'][:12]}); "
+        "± standard error over seeds; bold: best of the BC methods and of the MGAIL methods; collisions are counted "
+        "at states only, as the paper counts them"
     ]
     horizons = sorted({round(entry.record["horizon"], 1) for entry in entries if "horizon" in entry.record})
     if any(each != setting_seconds(record) for each in horizons):
         notes.append(f"rollouts last {' or '.join(f'{each:g}' for each in horizons)} s")
-    between = [
-        f"{method_name(entry.method)} {entry.record['collision_rate']:.2f} %"
-        for entry in entries
-        if entry.record.get(AT_STATES, entry.record["collision_rate"]) != entry.record["collision_rate"]
-    ]
-    found = f"; with those between states: {', '.join(dict.fromkeys(between))}" if between else ""
-    notes.append(f"collisions are counted at states only, as the paper counts them{found}")
     ways: dict[str, dict[str, None]] = {}
     for entry in entries:
-        config = entry.record["config"]
-        way = f"{simulation_way(config)}, {config['rollouts']} rollouts"
+        way = f"{entry.way}, {entry.record['config']['rollouts']} rollouts"
         ways.setdefault(way, {})[method_name(entry.method)] = None
     notes += [f"simulated {way}: {', '.join(methods)}" for way, methods in ways.items()]
     for method in dict.fromkeys(entry.method for entry in entries):
-        mine = [_flat(entry.config) for entry in entries if entry.method == method]
-        names = dict.fromkeys(name for config in mine for name in config)
+        mine = [entry.config for entry in entries if entry.method == method]
+        names = dict.fromkeys(name for config in mine for name in config if name not in _FREE)
         differing = [name for name in names if len({json.dumps(config.get(name)) for config in mine}) > 1]
         if differing:
             notes.append(f"runs of {method_name(method)} differ in {', '.join(differing)}")
-    if dataset is None and (year := _wosac_year(entries)):
-        notes.append(f"WOSAC {year}: 32 rollouts of 8 s of all vehicles; higher is better")
     for entry in entries:
-        run, now = entry.record["run"], updates_done(entry.folder)
+        run, now = entry.record["run"], records.updates_done(entry.folder)
         if run["updates"] and now and run["updates"] != now:
             notes.append(f"{entry.folder} was evaluated after {run['updates']} updates and has {now} now")
-        if run.get("named"):
-            at = run["checkpoint"]
-            notes.append(
-                f"{entry.folder} was evaluated at its checkpoint {at}, which it would not choose itself"
-            )
+        if run["named"]:
+            notes.append(f"{entry.folder} was evaluated at checkpoint {run['checkpoint']}, not its own")
     if dataset is not None:
         notes.append(f"paper: Igl et al. 2022, {dataset} dataset, five seeds")
+    elif year := _wosac_year(entries):
+        notes.append(f"WOSAC {year}: 32 rollouts of 8 s of all vehicles; higher is better")
     return notes
 
 
-def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{name}.")
-        elif prefix + name not in _FREE:
-            flat[prefix + name] = value
-    return flat
+def markdown(grid: Sequence[Sequence[str]]) -> str:
+    """Return lines of cells, the heading first, as a table in Markdown that reads well as it is."""
+    widths = [max(map(len, column)) for column in zip(*grid, strict=True)]
+    rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
+    lines = []
+    for first, *others in [grid[0], rule, *grid[1:]]:
+        cells = [cell.rjust(width) for cell, width in zip(others, widths[1:], strict=True)]
+        lines.append(f"| {' | '.join([first.ljust(widths[0]), *cells])} |\n")
+    return "".join(lines)
+
+
+def table_text(table: Mapping[str, Any]) -> str:
+    """Return a table in Markdown, with the paper's figures in columns of their own."""
+
+    def shown(cell: Mapping[str, Any], column: Column) -> str:
+        if math.isnan(cell.get("mean", math.nan)):
+            return "–"
+        error = "" if math.isnan(cell["se"]) else f" ± {column.shown(cell['se'])}"
+        text = column.shown(cell["mean"]) + error
+        return f"**{text}**" if cell.get("best") else text
+
+    paper, grid = table["paper"] is not None, [["method", "seeds"]]
+    # Of a metric of a user's own the name in its module.
+    columns = {key: COLUMNS.get(key) or Column(key.rpartition(":")[2], "", 3) for key in table["columns"]}
+    for column in columns.values():
+        grid[0] += [f"{column.title} {column.unit}".strip(), *["paper"] * paper]
+    for row in table["rows"]:
+        grid.append([row["name"], str(len(row["seeds"]) or "")])
+        for key, column in columns.items():
+            cells = (row[key], row["paper"].get(key, {}))
+            grid[-1] += [shown(cell, column) for cell in cells[: 1 + paper]]
+    notes = "".join(f"\\{letter}" if letter in "_*|" else letter for letter in "; ".join(table["notes"]))
+    return f"{markdown(grid)}\n{table['interactive']} interactive agents, {table['duration']} s: {notes}.\n"

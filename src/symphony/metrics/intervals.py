@@ -43,6 +43,14 @@ def ratio(
     return float(rate), float(np.sqrt((residual**2).sum() / (count - 1) / count))
 
 
+def grouped_mean(
+    value: NDArray[np.float64], weight: NDArray[np.float64], member: NDArray[np.int64]
+) -> tuple[float | None, float | None]:
+    """Weighted mean and its standard error over groups (see :func:`ratio`); None for NaN."""
+    mean, error = ratio(value * weight, weight, member)
+    return None if math.isnan(mean) else mean, None if math.isnan(error) else error
+
+
 def clustered_mean(values: NDArray[np.float64], member: NDArray[np.int64]) -> tuple[float, float]:
     """Mean of the finite ones of some values and its standard error, where those of one group are not independent.
 
@@ -55,9 +63,7 @@ def clustered_mean(values: NDArray[np.float64], member: NDArray[np.int64]) -> tu
 
 
 def zero_bound(of: int) -> float:
-    """Percent that a rate has at most, with 95 % confidence, of which so many independent samples show nothing.
-
-    It is about 300 / n.
+    """Percent, about 300 / n, that a rate has at most, with 95 % confidence, of which n samples show nothing.
 
     Source: Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26 (1934).
     """

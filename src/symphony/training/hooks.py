@@ -21,16 +21,17 @@ from symphony.config import EvaluateConfig, RunConfig, ValidationConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.evaluator import evaluate_dataset
-from symphony.evaluation.pictures import clip_of
+from symphony.evaluation.evaluator import evaluate
 from symphony.files import naming
 from symphony.geometry.frames import wrap
 from symphony.learning import SearchReplay
 from symphony.learning.demonstrations import SceneDataset, evenly_spaced
 from symphony.learning.experts import logged
 from symphony.render import animate_rollouts
+from symphony.render.plots import saved_clip
 from symphony.rollouts.driving import simulate_batch
 from symphony.rollouts.unroll import Rollouts
+from symphony.saved.rollouts import saved_rollouts
 from symphony.training.logging import Tracker
 from symphony.training.trainer import Trainer
 
@@ -92,7 +93,7 @@ class Validator:
         whose collision rate plus off-road time is lowest (paper, section V-B).
         """
         with undisturbed(self.agent, self.device):
-            found = evaluate_dataset(self.agent, self.dataset, self.how, progress).metrics.compute()
+            found = evaluate(self.agent, self.dataset, self.how, progress).metrics.compute()
         # Where no map has a boundary nobody can be off the road.
         off = found["offroad_time"] if found["offroad_segments"] else 0.0
         infractions = found["collision_rate"] + off
@@ -151,7 +152,10 @@ class Previewer:
         samples = samples_of(scenes, rollouts, [segment.dt for segment in segments])
         samples |= {f"score_{name}": _finite(values.cpu()) for name, values in scores.items()}
         video = self.folder / f"rollout-{step:06d}.gif"
-        clips = [clip_of(segments[b], scenes, rollouts, b, 1) for b in range(min(PANELS, len(segments)))]
+        clips = [
+            saved_clip(saved_rollouts(segments[b], scenes, rollouts, b), 1)
+            for b in range(min(PANELS, len(segments)))
+        ]
         with naming(video):
             animate_rollouts(clips, video)
         if tracker is not None:
