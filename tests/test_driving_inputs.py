@@ -21,6 +21,7 @@ from symphony.config import AgentConfig, MGAILConfig, PerturbConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, DrivingEnv
+from symphony.envs.objects import Observers
 from symphony.envs.observation import OBJECT_FEATURES, SELF_FEATURES, ObservationConfig
 from symphony.envs.points import observed_lights
 from symphony.envs.routes import ALONG_FEATURES, POINTS, ROUTE_FEATURES, SPACING, RouteWindow, along_route
@@ -134,7 +135,7 @@ def test_beyond_the_end_of_the_route_and_without_one_nothing_is_said() -> None:
         assert (along_route(own, size, others, sizes, seen) == 0).all()
 
 
-@pytest.mark.parametrize("method", ["bc", "bc_ts_h", "mgail_h"])
+@pytest.mark.parametrize("method", ["bc", "mgail_h"])
 def test_a_recipe_learns_with_all_of_it(method: str, tmp_path: Path) -> None:
     agent = AgentConfig(num_points=12, num_lights=2, features="gaps", accelerations=9, hidden=8)
     mgail = MGAILConfig(regression=2, head_start=1, rollouts=2, expert_weight=0.1, react=True)
@@ -172,13 +173,14 @@ def test_lights_seen_are_the_nearest_of_all(data: SceneDataset) -> None:
     scenes = data.scenes(items)
     rng = torch.Generator().manual_seed(0)
     origin = 30.0 * torch.randn(len(items), 2, 2, generator=rng)
-    heading, speed = torch.randn(len(items), 2, generator=rng), torch.rand(len(items), 2, generator=rng)
-    row, step = torch.arange(len(items)), torch.zeros(len(items), dtype=torch.int64)
-    tables = Tables(scenes, EVERYTHING)
-    found, mask = observed_lights(tables, row, step, origin, heading, speed)
+    state = torch.cat([origin, torch.randn(len(items), 2, 3, generator=rng)], -1)
+    row, none = torch.arange(len(items)), torch.zeros(len(items), 2)
+    heading, speed = state[..., 2], state[..., 3]
+    who = Observers(row, torch.zeros_like(row), none.long(), state, origin, None, origin, heading, speed)
+    found, mask = observed_lights(Tables(scenes, EVERYTHING), who)
     # All points at once, of which those of lights are told by their state.
     wide = replace(EVERYTHING, num_lights=scenes.point.shape[1])
-    everything, known = observed_lights(Tables(scenes, wide), row, step, origin, heading, speed)
+    everything, known = observed_lights(Tables(scenes, wide), who)
     assert mask.all()
     for b in range(len(items)):
         lights = scenes.point[b][(scenes.point_light[b] >= 0) & scenes.point_valid[b]]
@@ -201,11 +203,3 @@ def test_a_batch_changes_nothing_of_what_is_seen(data: SceneDataset) -> None:
         one = alone.with_goals(alone.start(torch.tensor([0]))).get(("agents", "observation"))
         for name in ("along", "gap", "gap_ahead", "lights", "lights_mask", "route"):
             torch.testing.assert_close(seen.get(name)[k], one.get(name)[0], msg=name)
-
-
-def test_the_environment_shows_what_its_specification_says(data: SceneDataset) -> None:
-    env = DrivingEnv(data.scenes([0, 1]), Bicycle(), EVERYTHING)
-    start = env.with_goals(env.start(torch.arange(2)))
-    for name, spec in env.observation_spec[("agents", "observation")].items():
-        value = start.get(("agents", "observation", name))
-        assert (value.shape[2:], value.dtype) == (spec.shape[1:], spec.dtype), name

@@ -129,11 +129,10 @@ def _halves(points: NDArray[Any]) -> list[NDArray[Any]]:
     return [points[: middle + 1], points[middle:]]
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_conversion_joins_and_counts_them(workers: int, tmp_path: Path) -> None:
+def test_conversion_joins_and_counts_them(tmp_path: Path) -> None:
     (tmp_path / "a.cut").write_text("1 2")
     (tmp_path / "b.cut").write_text("3")
-    report = convert(Cut(), [tmp_path], tmp_path / "out", workers=workers)
+    report = convert(Cut(), [tmp_path], tmp_path / "out", workers=2)
     store = SegmentStore(tmp_path / "out")
     each = len(store[0].road.lanes) // 2
     assert [store.tags(k)["joined_gaps"] for k in range(3)] == [each] * 3
@@ -144,6 +143,6 @@ def test_conversion_joins_and_counts_them(workers: int, tmp_path: Path) -> None:
     del old["joined_gaps"]
     assert Report.from_json(old).joined_gaps == 0
     (tmp_path / "c.cut").write_text("4")
-    convert(Cut(), [tmp_path / "c.cut"], tmp_path / "more", workers=workers)
+    convert(Cut(), [tmp_path / "c.cut"], tmp_path / "more", workers=2)
     merge([tmp_path / "out", tmp_path / "more"], tmp_path / "both")
     assert info(tmp_path / "both")["joined_gaps"] == 4 * each

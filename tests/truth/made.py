@@ -27,33 +27,19 @@ GREEN, RED = SignalState.GO, SignalState.STOP
 
 @dataclass(frozen=True)
 class Track:
-    """A way: straight at constant speed, but for braking (or speeding up) and going aside, each in a span of time.
+    """A way: straight at constant speed, but for braking (or speeding up) and going aside, each in a span of time."""
 
-    Attributes:
-        x: at time 0.
-        y: at time 0.
-        speed: along the heading at time 0, negative for backwards.
-        heading: of the whole way; going aside turns it by no more than its angle.
-        change: (begin, end, m/s^2) of the speed.
-        aside: (begin, end, metres to the left).
-        turned: whether the heading follows when it goes aside.
-        size: of the box.
-        kind: of the agent.
-        there: (begin, end) seconds at which it is seen.
-        z: of the road below it.
-    """
-
-    x: float
+    x: float  # at time 0
     y: float
-    speed: float
-    heading: float = 0.0
-    change: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    aside: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    turned: bool = True
+    speed: float  # along the heading at time 0, negative for backwards
+    heading: float = 0.0  # of the whole way; going aside turns it by no more than its angle
+    change: tuple[float, float, float] = (0.0, 0.0, 0.0)  # begin, end, m/s^2 of the speed
+    aside: tuple[float, float, float] = (0.0, 1.0, 0.0)  # begin, end, metres to the left
+    turned: bool = True  # whether the heading follows when it goes aside
     size: tuple[float, float] = CAR
     kind: AgentType = AgentType.VEHICLE
-    there: tuple[float, float] = (-1.0, 99.0)
-    z: float = 0.0
+    there: tuple[float, float] = (-1.0, 99.0)  # seconds from and until which it is seen
+    z: float = 0.0  # of the road below it
 
     def at(self, time: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
         """Positions [T, 2], headings [T] and velocities [T, 2]."""
@@ -74,33 +60,21 @@ class Track:
 
 @dataclass(frozen=True)
 class Case:
-    """A scene, and what must be said of it.
+    """A scene, and what must be said of it and why."""
 
-    Attributes:
-        name: of the scene; cases of several speeds end with theirs.
-        why: the values are right.
-        ego: what it does; its box is a car's unless it says otherwise.
-        others: who else is there.
-        right: the values, by the name of the number; see :func:`test_truth.check`.
-        log: what the ego does in the log; by default the same.
-        light: of the eastern lanes as (second, state), each until the next; none without.
-        lanes: whether the map has lanes that cars drive in.
-        boundary: whether it has a boundary.
-        bridge: height of the road across over the other one.
-        deck: height of a road to the west above the own lane; 0 for none.
-    """
-
-    name: str
+    name: str  # cases of several speeds end with theirs
     why: str
-    ego: Track
+    ego: Track  # its box is a car's unless it says otherwise
     others: tuple[Track, ...] = ()
-    right: dict[str, Any] = field(default_factory=dict)
-    log: Track | None = None
-    light: tuple[tuple[float, SignalState], ...] = ()
-    lanes: bool = True
+    right: dict[str, Any] = field(default_factory=dict)  # by the name of the number, see test_truth.check
+    log: Track | None = None  # what the ego does in the log; by default the same
+    light: tuple[
+        tuple[float, SignalState], ...
+    ] = ()  # of the eastern lanes: second and state, until the next
+    lanes: bool = True  # whether the map has lanes that cars drive in
     boundary: bool = True
-    bridge: float = 0.0
-    deck: float = 0.0
+    bridge: float = 0.0  # height of the road across over the other one
+    deck: float = 0.0  # height of a road to the west above the own lane; 0 for none
 
 
 def _line(*ends: tuple[float, float]) -> NDArray[Any]:

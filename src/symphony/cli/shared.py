@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, dataclass_transform
 
 from tyro.conf import Positional, arg
 
-import symphony
 from symphony.config import EvaluateConfig
 from symphony.config.checks import Bounds, Count
 from symphony.config.evaluation import Engine
