@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch.testing import assert_close
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
-from torchrl.envs import EnvBase, PendulumEnv, StepCounter
+from torchrl.envs import EnvBase, PendulumEnv
 
 from helpers_collectors import ACTION, STREAM, Policy, Walk, X, assert_same, distance, give_streams
 from symphony.collectors import (
@@ -132,17 +132,6 @@ def test_trajectories_are_complete_and_stop_at_their_end():
     one = {"trajs_per_batch": 1, "traj_format": "cat"}
     assert not list(make(**one))
     assert len(list(make(set_truncated=True, **one))) == 3 * ROWS
-
-
-@pytest.mark.filterwarnings("ignore:Nested TransformedEnvs:UserWarning")
-def test_without_rows_and_with_other_transforms():
-    (batch,) = make(Walk, frames_per_batch=STEPS, total_frames=STEPS)
-    assert batch.shape == (STEPS,)
-    counted = next(iter(make(functools.partial(make_env, 1000, StepCounter(max_steps=5)))))
-    assert (counted.get("step_count").squeeze(-1) == torch.arange(STEPS)).all()
-    assert counted.get(("collector", "mask")).sum(-1).tolist() == [5] * ROWS
-    limited = next(iter(make(max_frames_per_traj=3)))
-    assert limited.get(("collector", "mask")).sum(-1).tolist() == [3] * ROWS
 
 
 @pytest.mark.parametrize("options", [{}, {"init_random_frames": FRAMES}])

@@ -1,21 +1,231 @@
-"""Laws of the pruning rules."""
+"""Pruning rules, the search as a particle filter, and how ends of episodes are counted."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase
 
-from symphony.collectors import KeepAll, KeepBest, ReplaceBad, Residual, Stratified, Systematic
+from helpers_collectors import Mass, Walk, distance, starts
+from symphony.collectors import (
+    Aggregate,
+    BeamSearchCollector,
+    BeamSearchResult,
+    KeepAll,
+    KeepBest,
+    KeyScore,
+    ReplaceBad,
+    Resampling,
+    Residual,
+    Stratified,
+    Systematic,
+    beam_search,
+    branch,
+    with_rows,
+)
 from symphony.collectors.rules import checked
+
+STEPS, KEPT, SPREAD = 8, 0.9, 0.5
+SCHEMES = (Systematic, Stratified, Residual)
+
+
+class Filtered(EnvBase):
+    """x' = 0.9 x + action, seen as y with noise; the reward is the log-likelihood of what was seen."""
+
+    batch_locked = False
+
+    def __init__(self) -> None:
+        super().__init__(batch_size=[])
+        self.observation_spec = Composite(
+            x=Unbounded((1,)), t=Unbounded((1,), dtype=torch.int64), y=Unbounded((STEPS,))
+        )
+        self.state_spec, self.action_spec = self.observation_spec.clone(), Unbounded((1,))
+        self.reward_spec = Unbounded((1,))
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        raise NotImplementedError
+
+    def _step(self, td: TensorDictBase) -> TensorDictBase:
+        x = KEPT * td["x"] + td["action"]
+        seen = torch.distributions.Normal(x, SPREAD).log_prob(td["y"].gather(-1, td["t"]))
+        done = torch.zeros_like(seen, dtype=torch.bool)
+        return TensorDict({"x": x, "t": td["t"] + 1, "y": td["y"], "reward": seen, "done": done}, td.shape)
+
+
+def observed(rows: int) -> tuple[Tensor, Tensor, Tensor]:
+    """What is seen [rows, T], and by Kalman's filter its log-evidence and the mean of the last state."""
+    y, x = [], torch.zeros(rows)
+    for _ in range(STEPS):
+        x = KEPT * x + torch.randn(rows)
+        y.append(x + SPREAD * torch.randn(rows))
+    mean, variance, evidence = torch.zeros(rows), 0.0, torch.zeros(rows)
+    for seen in y:
+        mean, variance = KEPT * mean, KEPT**2 * variance + 1.0
+        total = variance + SPREAD**2
+        evidence = evidence + torch.distributions.Normal(mean, math.sqrt(total)).log_prob(seen)
+        mean = mean + variance / total * (seen - mean)
+        variance *= 1 - variance / total
+    return torch.stack(y, -1), evidence, mean
+
+
+def filtered(y: Tensor, rule: Any, branches: int, **how: Any) -> BeamSearchResult:
+    rows = len(y)
+    start = TensorDict(
+        {"x": torch.zeros(rows, 1), "t": torch.zeros(rows, 1, dtype=torch.int64), "y": y}, [rows]
+    )
+    noise = torch.rand(rows, STEPS, *([branches] if rule.noise_per_slot else []))
+    how |= {"steps": STEPS, "prune_every": 1, "aggregate": Aggregate("sum"), "keep": [("next", "x")]}
+
+    def policy(td: TensorDictBase) -> TensorDictBase:
+        return td.set("action", torch.randn(*td.shape, 1))
+
+    score, start = KeyScore("reward", negate=True), branch(start, branches)
+    return beam_search(Filtered(), policy, score, start, rule=rule, noise=noise, **how)
+
+
+@pytest.mark.parametrize("threshold", [1.0, 0.5, 0.0])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_the_evidence_is_that_of_kalmans_filter(scheme: type[Resampling], threshold: float) -> None:
+    """Without bias, however often the rows are resampled; so are weighted means of what survives."""
+    torch.manual_seed(0)
+    y, evidence, mean = observed(40)
+    y, evidence, mean = (part.repeat_interleave(25, 0) for part in (y, evidence, mean))
+    found = filtered(y, scheme(threshold=threshold), 128, prune_last=False)
+    assert found.log_evidence is not None
+    assert found.leaf_log_weights is not None
+    assert found.sample_size is not None
+    ratio = (found.log_evidence - evidence).exp()
+    if threshold:  # else one weight is all there is, and no mean of a thousand tells a bias
+        assert abs(float(ratio.mean()) - 1) < 4 * float(ratio.std()) / math.sqrt(len(ratio))
+        assert float(ratio.std()) < 1.0
+        share = torch.softmax(found.leaf_log_weights, -1)
+        error = (share * found.trajectories["next", "x"][..., -1, 0]).sum(-1) - mean
+        assert float(error.square().mean().sqrt()) < 0.15
+    torch.testing.assert_close(found.leaf_log_weights.exp().mean(-1), torch.ones(len(y), dtype=torch.float64))
+    assert (found.sample_size >= 1 - 1e-6).all()
+    assert (found.sample_size <= 128 + 1e-6).all()
+    kept = (found.parents == torch.arange(128)).all(-1)[:, :-1]
+    assert torch.equal(kept, found.sample_size[:, :-1] > threshold * 128) or threshold == 1.0
+    assert (found.descendants.sum(-1) == 128).all()
+
+
+def test_a_value_looks_ahead_without_a_bias() -> None:
+    """Branches chosen for what they are worth are weighed back when it comes."""
+    torch.manual_seed(0)
+    y, evidence, _ = observed(40)
+    y, evidence = y.repeat_interleave(25, 0), evidence.repeat_interleave(25, 0)
+
+    def value(td: TensorDictBase) -> Tensor:
+        coming = td["y"].gather(-1, td["t"].clamp_max(STEPS - 1))
+        ahead = 0.2 * (coming - KEPT * td["x"]).square().squeeze(-1)
+        return torch.where(td["t"].squeeze(-1) < STEPS, ahead, 0.0)
+
+    found = filtered(y, Systematic(), 128, value=value)
+    assert found.log_evidence is not None
+    ratio = (found.log_evidence - evidence).exp()
+    assert abs(float(ratio.mean()) - 1) < 4 * float(ratio.std()) / math.sqrt(len(ratio))
+
+
+@pytest.mark.parametrize(("rule", "weighs"), [(Stratified(threshold=0.5), True), (KeepBest(), False)])
+def test_weights_are_in_the_batch(rule: Any, weighs: bool) -> None:
+    how = {"branches": 4, "leaves": 4, "prune_every": 3, "aggregate": Aggregate("sum")}
+    score = KeyScore("reward", negate=True)
+    collector = BeamSearchCollector(
+        with_rows(Mass(), [3]), score=score, rule=rule, frames_per_batch=96, **how
+    )
+    fake, batch = collector.fake_tensordict(), collector.next()
+    key = ("collector", "log_weight")
+    assert (key in batch.keys(True, True)) == (key in fake.keys(True, True)) == weighs
+    if weighs:
+        torch.testing.assert_close(batch[key].exp().mean(1), torch.ones(3, 8))
+
+
+@pytest.mark.parametrize("rule", [KeepBest(), Systematic(0.3), KeepAll()], ids=repr)
+@pytest.mark.parametrize("agents", [None, 2])
+@pytest.mark.parametrize("time", ["max", "mean", "sum", "last"])
+def test_what_follows_an_end_changes_nothing(rule: Any, agents: int | None, time: Any) -> None:
+    """Neither what scores are then, nor that the environment comes back into its bounds."""
+    start = branch(with_rows(Mass(agents=agents), [20]).reset(), 4)
+    group = () if agents is None else ("agents",)
+
+    def policy(td: TensorDictBase) -> TensorDictBase:
+        place = td.get((*group, "place"))
+        return td.set((*group, "action"), (place.sum(-1, keepdim=True) * 917.0).sin())
+
+    def found(sticky: bool, garbage: float, **how: Any) -> BeamSearchResult:
+        def score(td: TensorDictBase) -> Tensor:
+            x, v = td.get((*group, "place")).unbind(-1)
+            over = (x - 0.5 * v).abs() > 1.5  # so was the state before
+            return torch.where(over, garbage, -td.get((*group, "reward")).squeeze(-1))
+
+        env, noise = Mass(agents=agents, sticky=sticky), torch.full((20, 4), 0.3)
+        how |= {"steps": 12, "prune_every": 3, "rule": rule, "aggregate": Aggregate(time), "noise": noise}
+        return beam_search(env, policy, score, start, **how)
+
+    results = [found(sticky, garbage) for sticky in (True, False) for garbage in (0.0, 1e4, -1e4)]
+    for one in results[1:]:
+        for name in ("scores", "totals", "parents", "slots", "alive"):
+            assert torch.equal(getattr(one, name), getattr(results[0], name)), name
+    alive = results[0].alive
+    assert not alive.all()
+    assert (alive[..., 1:] <= alive[..., :-1]).all()
+    assert found(True, 1e4, until_done=False).scores.max() == 1e4
+
+
+def test_rows_that_have_ended_are_left_alone() -> None:
+    """Their leaves are those of the last period in which an episode went on."""
+    start = starts(Walk(), 3, branches=4)
+
+    def policy(td: TensorDictBase) -> TensorDictBase:
+        return td.set(("agents", "action"), td["agents", "x"].sin())
+
+    how = {"prune_every": 2, "leaves": 3}
+    long, short = (beam_search(Walk(last=5), policy, distance, start, steps=n, **how) for n in (16, 6))
+    assert (long.parents[:, 3:] == torch.arange(4)).all()
+    assert torch.equal(long.alive[..., :6], short.alive)
+    assert torch.equal(long.slots[:, :3], short.slots)
+    assert torch.equal(long.totals[:, :3], short.totals)
+    assert (long.totals[:, 3:] == 0).all()
+    assert long.alive.sum(-1).unique().tolist() == [5]
+
+
+@given(st.integers(1, 6), st.integers(0, 1000))
+def test_a_total_is_that_of_the_steps_that_count(length: int, seed: int) -> None:
+    scores = torch.randn(3, 6, 2, generator=torch.Generator().manual_seed(seed))
+    alive = (torch.arange(6) < length)[:, None].expand(3, 6, 1)
+    for time in ("max", "mean", "sum", "last"):
+        for agents in ("sum", "max", "mean"):
+            whole = Aggregate(time, agents)
+            torch.testing.assert_close(whole(scores, alive), whole(scores[:, :length]))
+
+
+def test_a_search_by_reward_keeps_an_episode_going() -> None:
+    """Points that are paid for every step within their bounds stay there for longer."""
+
+    def steps(branches: int) -> float:
+        torch.manual_seed(0)
+        env, how = with_rows(Mass(limit=1.0), [32]), {"prune_every": 3, "aggregate": Aggregate("sum")}
+        how |= {"score": lambda td: -torch.ones(td.shape), "frames_per_batch": 32 * 60}
+        collector = BeamSearchCollector(env, branches=branches, **how)
+        return float(collector.next()["collector", "mask"].sum(-1).float().mean())
+
+    assert steps(16) > 3 * steps(1)
+
 
 NUMBERS = st.floats(-1e3, 1e3, width=32)
 ODD = NUMBERS | st.sampled_from([math.inf, -math.inf, math.nan, 0.0])
 NOISE = st.floats(0, 1, exclude_max=True)
-SCHEMES = (Systematic, Stratified, Residual)
 
 
 @given(st.lists(ODD, min_size=1, max_size=17), st.floats(0.01, 1.0))

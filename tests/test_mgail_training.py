@@ -222,18 +222,3 @@ def test_the_duration_cuts_segments(seconds: Path, tmp_path: Path) -> None:
         assert (cut.position == full.position[:, :6]).all()
         assert cut.signal_state.shape[1] == cut.valid.shape[1] == cut.num_steps == 6
         assert short.experts(item).states.shape[1] == 6
-
-
-def test_eight_agents_train(tmp_path: Path) -> None:
-    late = hide(crossing(10, seed=1, steps=9), 2, slice(5, 9))
-    fill(tmp_path / "store", [straight_road(9, seed=0, steps=7), late])
-    both = MGAILConfig(regression=1, head_start=0, rollouts=3)
-    settings = config("mgail_ts_h", tmp_path / "store", tmp_path / "run", steps=3, mgail=both)
-    run = train(replace(settings, agent=replace(settings.agent, interactive=8)))
-    records = read_metrics(run)
-    assert all(0 < r["gradient_norm_policy"] < math.inf for r in records)
-    assert records[-1]["skipped_updates"] == 0
-    assert "policy_mgail_score" in records[-1]
-    found = evaluate(str(run), tmp_path / "store", SETTINGS)
-    assert found.interactive == 8
-    assert math.isfinite(float(found.numbers()["ade"]))

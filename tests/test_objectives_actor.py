@@ -24,7 +24,6 @@ from helpers_objectives import (
     check_contract,
     gaussian_actor,
     learned,
-    trained,
 )
 from symphony.objectives import BCLoss, DistillationLoss
 
@@ -83,15 +82,6 @@ def test_distillation_is_one_bc_loss_per_kind(continuous, reduction):
         torch.testing.assert_close(out[name], bc(td, expert, name))
 
 
-def test_distillation_without_reduction_keeps_the_shape():
-    td = batch(6, 5)
-    out = DistillationLoss(categorical_actor(), reduction="none", label_smoothing=0.2)(td)
-    assert {value.shape for value in out.values()} == {td[VALID].shape}
-    torch.testing.assert_close(out["loss_distillation"], bc(td, reduction="none", label_smoothing=0.2))
-    torch.testing.assert_close(out["nll_expert"] + out["nll_rollout"], bc(td, reduction="none").detach())
-    assert (out["nll_expert"][td[ROLLOUT]] == 0).all()
-
-
 def test_more_rollouts_weigh_no_more_and_a_kind_that_is_absent_adds_nothing():
     td = batch(20)
     rollouts = td[td[ROLLOUT][:, 0]]
@@ -127,12 +117,6 @@ def test_it_keeps_the_contract_of_torchrl(kind, continuous):
         return kind(actor(), use_mask=True, **arguments)
 
     check_contract(make, td, 2 if continuous else 4, dirty)
-
-
-def test_training_it_imitates():
-    td = batch(200)
-    td[ACTION] = (td[OBSERVATION][..., 0] > 0).long() + 2 * (td[OBSERVATION][..., 1] > 0).long()
-    assert trained(BCLoss(categorical_actor()), td, 150)[1]["accuracy"] > 0.95
 
 
 def test_a_mask_counts_where_there_is_one():

@@ -30,10 +30,10 @@ class Squeeze(nn.Module):
         return self.network(*inputs).squeeze(-1)
 
 
-def discriminator(dtype=torch.float32, score=SCORE):
+def discriminator():
     torch.manual_seed(0)
-    net = nn.Sequential(nn.Linear(4, 16), nn.Tanh(), nn.Linear(16, 1)).to(dtype)
-    return TensorDictModule(Squeeze(net), in_keys=[OBSERVATION], out_keys=[score])
+    net = nn.Sequential(nn.Linear(4, 16), nn.Tanh(), nn.Linear(16, 1))
+    return TensorDictModule(Squeeze(net), in_keys=[OBSERVATION], out_keys=[SCORE])
 
 
 def batch(*shape, agents=3):
@@ -123,14 +123,6 @@ def test_it_keeps_the_contract_of_torchrl(arguments):
     check_contract(make, td, 4, dirty)
 
 
-def test_the_key_of_the_score_can_be_set():
-    loss = DiscriminatorLoss(discriminator(score="score"))
-    with pytest.raises(KeyError, match="writes no score"):
-        loss(batch(3))
-    loss.set_keys(score="score")
-    assert loss(batch(3))["loss_discriminator"] > 0
-
-
 @pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
 def test_the_penalty_of_a_linear_discriminator_is_its_weight(reduction):
     """The gradient of w . x is w wherever x is."""
@@ -184,21 +176,6 @@ def test_the_penalty_reaches_the_encoders_through_every_pool(monkeypatch):
     assert len(weights) == 1
     how = {"eps": 1e-7, "fast_mode": True}
     assert torch.autograd.gradcheck(lambda *_: loss(td)["loss_discriminator"], weights, **how)
-
-
-def test_the_penalty_is_that_of_each_agent_by_itself():
-    td = scenes(12, 7)
-    loss = DiscriminatorLoss(scene_discriminator(), gradient_penalty=1.0)
-    rows = []
-    for i, j in (td[VALID] & ~td[SIMULATED]).nonzero().tolist():
-        one = td[i : i + 1].clone()
-        leaves = [one["agents", name].requires_grad_() for name in ("own", "objects")]
-        for name, leaf in zip(("own", "objects"), leaves, strict=True):
-            one["agents", name] = leaf
-        gradients = torch.autograd.grad(scene_discriminator()(one)[SCORE][0, j], leaves)
-        rows.append(sum(gradient.square().sum() for gradient in gradients))
-    assert len(rows) > 1
-    torch.testing.assert_close(loss(td)["gradient_penalty"], torch.stack(rows).mean())
 
 
 def test_bad_inputs_are_refused():

@@ -147,15 +147,6 @@ def test_it_keeps_the_contract_of_torchrl():
     check_contract(make, td, 3, dirty)
 
 
-def test_the_key_of_the_logits_can_be_set():
-    network = TensorDictModule(Choice(), in_keys=[ROUTES], out_keys=["logits"])
-    loss = GoalLoss(network)
-    with pytest.raises(KeyError, match="writes no logits"):
-        loss(batch(3))
-    loss.set_keys(logits="logits")
-    assert loss(batch(3))["loss_goal"] > 0
-
-
 def test_bad_inputs_are_refused():
     loss = GoalLoss(goal_network())
     td = batch(5)
