@@ -84,7 +84,7 @@ def test_points_are_seen_as_by_the_plain_formula(scenes: SceneBatch) -> None:
     tables = Tables(scenes, FEW)
     x, y, heading, speed = pose.clone().requires_grad_().unbind(-1)
     state = torch.stack([x, y, heading, speed * heading.cos(), speed * heading.sin()], -1)
-    objects = Objects(state, torch.ones_like(x, dtype=torch.bool), state[..., :2], x.long())
+    objects = Objects(state, torch.ones_like(x, dtype=torch.bool), state[..., :2])
     who = Observers.of(objects, row, step, torch.arange(3).expand(x.shape))
     found, mask = observed_points(tables, who)
     chosen = oracle.nearest_points(scenes, row, where, FEW.num_points)

@@ -19,12 +19,13 @@ from torch import nn
 from symphony.agents.checkpoint import (
     CheckpointError,
     checkpoints,
+    decode,
+    encode,
     latest,
     load_checkpoint,
     prune,
     save_checkpoint,
 )
-from symphony.agents.codec import decode, encode
 from symphony.errors import DataError, SymphonyError
 
 

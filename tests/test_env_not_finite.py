@@ -32,7 +32,6 @@ def test_others_still_collide(bad: float, who: int, monkeypatch: pytest.MonkeyPa
         state,
         torch.ones(1, 4, dtype=torch.bool),
         torch.tensor([4.0, 2.0]).expand(1, 4, 2),
-        torch.ones(1, 4, dtype=torch.int64),
     )
     index = torch.arange(4)[None]
     found = collision_flags(objects, index)

@@ -35,7 +35,7 @@ from symphony.roadgraph import (
     starting_lanes,
 )
 from symphony.roadgraph import ground_truth_routes as ground_truth
-from symphony.roadgraph.paths import arc_lengths, at, beside, own_sharpest, sharpest
+from symphony.roadgraph.paths import arc_lengths, at, beside, distinct, sharpest
 from symphony.roadgraph.routes import MAX_LANES, change_length, ends_inside, resampled, route_errors
 
 SPACING = 1.0
@@ -332,6 +332,16 @@ def maps():
         road, name = make()
         found.append((road, [name[entry] for entry in entries]))
     return found
+
+
+def own_sharpest(graph, lanes):
+    """What :func:`sharpest` gives for lanes themselves, were each to begin where the one before it ends."""
+    parts, end = [graph.lines[lanes[0]]], graph.lines[lanes[0]][-1]
+    for lane in lanes[1:]:
+        line = graph.lines[lane] - graph.lines[lane][0] + end
+        parts.append(line)
+        end = line[-1]
+    return sharpest(distinct(np.concatenate(parts)))
 
 
 @given(st.integers(0, 9), st.floats(0.0, 0.95), st.floats(0.0, 40.0))

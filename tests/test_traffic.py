@@ -44,7 +44,6 @@ def test_who_enters_would_meet_nobody_within_a_second(
         torch.stack(rows)[None].float(),
         torch.ones(1, 2, dtype=torch.bool),
         torch.tensor([[[4.5, 2.0], [4.5, 2.0]]]),
-        torch.zeros(1, 2, dtype=torch.int64),
     )
     for index, slot in (([[0]], 0), ([[1, 0]], 1)):
         ready = torch.zeros(1, len(index[0]), dtype=torch.bool)
@@ -60,7 +59,7 @@ def test_on_a_device_the_same_enter(seed: int, monkeypatch: pytest.MonkeyPatch) 
     state = torch.rand(rows, agents, 5, generator=rng) * torch.tensor([40.0, 12, 6, 12, 4])
     size = torch.tensor([4.5, 2.0]).expand(rows, agents, 2)
     valid = torch.rand(rows, agents, generator=rng) < 0.9
-    objects = Objects(state, valid, size, torch.zeros(rows, agents, dtype=torch.int64))
+    objects = Objects(state, valid, size)
     index = torch.rand(rows, agents, generator=rng).argsort(-1)[:, :driven]
     ready = (torch.rand(rows, driven, generator=rng) < 0.6) & valid.gather(1, index)
     found = entering(objects, index, ready)

@@ -11,15 +11,10 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from symphony.agents import networks
 from symphony.agents.checkpoint import CheckpointError, load_checkpoint
 from symphony.agents.choice import PREFIX, choose, split_name
-from symphony.agents.networks import (
-    discriminator_network,
-    dynamics_of,
-    goal_network,
-    observation_of,
-    policy_network,
-)
+from symphony.agents.networks import dynamics_of, observation_of
 from symphony.config import AgentSpec, EvaluateConfig, SearchConfig, read_json
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
@@ -33,42 +28,27 @@ FILE = "agent.json"
 
 
 class SearchPlan(NamedTuple):
-    """How the rollouts of a run segment come about, with nothing left open.
+    """How the rollouts of a run segment come about, with nothing left open."""
 
-    Attributes:
-        kind: of search; ``log`` for playback.
-        trees: of the run segment; independent rollouts are trees of one branch.
-        branches: of each tree.
-        taken: rollouts taken from each tree.
-        search: how branches are pruned.
-    """
-
-    kind: Literal["log", "none", "tree", "backtrack", "best"]
-    trees: int
-    branches: int
-    taken: int
-    search: SearchConfig
+    kind: Literal["log", "none", "tree", "backtrack", "best"]  # of search; log for playback
+    trees: int  # of the run segment; independent rollouts are trees of one branch
+    branches: int  # of each tree
+    taken: int  # rollouts taken from each tree
+    search: SearchConfig  # how branches are pruned
 
 
 @dataclass(frozen=True)
 class Agent:
-    """A policy and what it needs around it.
+    """A policy and what it needs around it."""
 
-    Attributes:
-        name: as given by the user.
-        policy: writes actions; None for log playback.
-        spec: what its networks are and how it is simulated; None for baselines.
-        goals: draws routes from first states; None for agents that follow none.
-        discriminator: scores states; None for agents trained without.
-        rule: name of what drives in place of the policy, along the routes of the log (see
-            ``symphony.rollouts.driving.RULES``); None for none.
-    """
-
-    name: str
-    policy: TensorDictModuleBase | None
-    spec: AgentSpec | None = None
+    name: str  # as given by the user
+    policy: TensorDictModuleBase | None  # writes actions; None for log playback
+    spec: AgentSpec | None = None  # what its networks are and how it is simulated; None for baselines
+    # Draws routes from first states; None for agents that follow none
     goals: TensorDictModuleBase | None = None
-    discriminator: TensorDictModuleBase | None = None
+    discriminator: TensorDictModuleBase | None = None  # scores states; None for agents trained without
+    # Name of what drives in place of the policy, along the routes of the log (see
+    # symphony.rollouts.driving.RULES); None for none
     rule: Literal["constant_velocity", "idm"] | None = None
 
     @property
@@ -135,14 +115,13 @@ class Agent:
                 f"search '{kind}' needs an agent with a discriminator, {self.name} has none, or another "
                 "score: --score flags or rule"
             )
+        branches, trees = search.test_branches, config.trees
         if kind != "tree":
-            return SearchPlan(kind, config.rollouts, search.test_branches if kind == "best" else 1, 1, search)
-        branches, taken = search.test_branches, config.rollouts // config.trees
-        if taken > branches:
-            raise ConfigError(
-                f"{config.trees} trees of {branches} branches give less than {config.rollouts} rollouts"
-            )
-        return SearchPlan(kind, config.trees, branches, taken, search)
+            return SearchPlan(kind, config.rollouts, branches if kind == "best" else 1, 1, search)
+        if config.rollouts // trees > branches:
+            what = f"{trees} trees of {branches} branches give less than {config.rollouts} rollouts"
+            raise ConfigError(what)
+        return SearchPlan(kind, trees, branches, config.rollouts // trees, search)
 
     def to(self, device: torch.device) -> Agent:
         """Move its networks to a device, in place."""
@@ -163,10 +142,10 @@ def build_agent(name: str, spec: AgentSpec) -> Agent:
     """An agent with fresh networks; seed torch beforehand."""
     return Agent(
         name,
-        policy_network(spec),
+        networks.policy_network(spec),
         spec,
-        goal_network(spec) if spec.goals else None,
-        None if spec.discriminator is None else discriminator_network(spec),
+        networks.goal_network(spec) if spec.goals else None,
+        None if spec.discriminator is None else networks.discriminator_network(spec),
     )
 
 
@@ -190,10 +169,8 @@ def load_agent(name: str, device: str = "cpu", *, trust_code: bool = False) -> A
 
     if name == PLAYBACK:
         return Agent(name, None)
-    if name == "constant_velocity":
-        return Agent(name, ConstantVelocity(Bicycle()))
-    if name == "idm":
-        return Agent(name, ConstantVelocity(Bicycle()), rule="idm")
+    if name in ("constant_velocity", "idm"):
+        return Agent(name, ConstantVelocity(Bicycle()), rule="idm" if name == "idm" else None)
     if name == "random":
         return Agent(name, RandomActions(Bicycle()))
     folder, which = split_name(name)
@@ -221,9 +198,10 @@ def _check_code(spec: AgentSpec, file: Path, trusted: bool) -> None:
         try:
             load_object(path, here=False)
         except ConfigError as error:
-            raise ConfigError(
-                f"{error}; for an agent's own code the current folder is not searched: name a file, or set PYTHONPATH"
-            ) from error
+            where = (
+                "for an agent's own code the current folder is not searched: name a file, or set PYTHONPATH"
+            )
+            raise ConfigError(f"{error}; {where}") from error
 
 
 def _check_sizes(name: str, spec: AgentSpec, file: Path, checkpoint: Path) -> None:
@@ -235,11 +213,9 @@ def _check_sizes(name: str, spec: AgentSpec, file: Path, checkpoint: Path) -> No
         raise ConfigError(f"{file}: no networks of these sizes: {str(error)[:200]}") from error
     for part, module in modules.items():
         asked = sum(tensor.numel() * tensor.element_size() for tensor in module.state_dict().values())
-        held = checkpoint / f"module.{part}.safetensors"
-        if held.is_file() and asked > held.stat().st_size:
-            raise CheckpointError(
-                f"has {held.stat().st_size} bytes, and {file} asks for a network of {asked}", file=held
-            )
+        file_of = checkpoint / f"module.{part}.safetensors"
+        if file_of.is_file() and asked > (held := file_of.stat().st_size):
+            raise CheckpointError(f"has {held} bytes, and {file} asks for a network of {asked}", file=file_of)
 
 
 def usable_device(name: str) -> torch.device:

@@ -2,26 +2,23 @@
 
 A checkpoint is a folder `step-<number>` that holds one safetensors file per module, optimizer and for the random
 number generators, and `checkpoint.json` with everything that is not a tensor, a checksum of each file and one of its
-own.
-
-Why not `torchrl.checkpoint` (0.14): it reads tensors through `tensordict.load`, which unpickles a file that the
-manifest doesn't mention, if one is planted beside them; it never flushes to the disk before the rename that
-publishes; and it restores component after component, so that a mismatch leaves the earlier ones overwritten.
+own. `torchrl.checkpoint` (0.14) would unpickle a planted file, flushes nothing before it publishes, and overwrites
+component after component where a later one does not fit.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import random
 import re
 import shutil
 import uuid
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,11 +26,12 @@ from safetensors.torch import load as decode_tensors
 from safetensors.torch import save as encode_tensors
 from torch import Tensor, nn
 
-from symphony.agents.codec import decode, encode
 from symphony.errors import DataError
 
 FORMAT = 1
 MANIFEST = "checkpoint.json"
+TAG = "$"
+"""Key of a JSON object that stands for something JSON lacks."""
 _NAME = re.compile(r"step-(\d{12})")
 
 
@@ -41,8 +39,7 @@ class CheckpointError(DataError):
     """A checkpoint that can't be written, read, or fitted to what it is loaded into."""
 
 
-@dataclass(frozen=True)
-class LoadedCheckpoint:
+class LoadedCheckpoint(NamedTuple):
     """The step that a checkpoint was saved at, and the caller's own values in it."""
 
     step: int
@@ -125,19 +122,16 @@ def load_checkpoint(
     manifest, file = _read_manifest(path), path / MANIFEST
     asked: dict[str, Any] = {f"module.{name}": item for name, item in (modules or {}).items()}
     asked |= {f"optimizer.{name}": item for name, item in (optimizers or {}).items()}
-    held = {part for part in manifest["parts"] if part not in ("rng", "extra")}
+    held = manifest["parts"].keys() - {"rng", "extra"}
     if absent := sorted(asked.keys() - held):
         raise CheckpointError(f"not in the checkpoint, which has {sorted(held)}", file=file, field=absent[0])
     if not partial and (surplus := sorted(held - asked.keys())):
         raise CheckpointError("in the checkpoint but not asked for", file=file, field=surplus[0])
     states = {part: _read_part(path, manifest, part) for part in ("rng", "extra", *asked)}
     rng = states["rng"]
-    if restore_rng and len(rng["cuda"]) not in (0, torch.cuda.device_count()):
-        raise CheckpointError(
-            f"random states of {len(rng['cuda'])} CUDA devices saved, {torch.cuda.device_count()} present",
-            file=file,
-            field="rng",
-        )
+    if restore_rng and (saved := len(rng["cuda"])) not in (0, torch.cuda.device_count()):
+        found = f"random states of {saved} CUDA devices saved, {torch.cuda.device_count()} present"
+        raise CheckpointError(found, file=file, field="rng")
     for part, item in asked.items():
         if isinstance(item, nn.Module):
             states[part] = _widened(item, states[part]) if widen else states[part]
@@ -213,11 +207,9 @@ def _publish(folder: Path, final: Path, files: Mapping[str, bytes]) -> None:
     try:
         new.mkdir()
         for name, content in files.items():
-            with (new / name).open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-        _flush_folder(new)
+            (new / name).write_bytes(content)
+            _flush(new / name)
+        _flush(new)
         if final.exists():
             if parked.exists():
                 shutil.rmtree(parked)
@@ -228,15 +220,15 @@ def _publish(folder: Path, final: Path, files: Mapping[str, bytes]) -> None:
             if parked.exists() and not final.exists():
                 parked.rename(final)
             raise
-        _flush_folder(folder)
+        _flush(folder)
         shutil.rmtree(parked, ignore_errors=True)
     except OSError:
         shutil.rmtree(new, ignore_errors=True)
         raise
 
 
-def _flush_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
+def _flush(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
@@ -244,33 +236,34 @@ def _flush_folder(folder: Path) -> None:
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
+    """What the manifest of a checkpoint says, checked but for the states inside."""
     file = path / MANIFEST
+
+    def refused(what: str, field: str | None = None) -> CheckpointError:
+        return CheckpointError(what, file=file, field=field)
+
     try:
         manifest = json.loads(file.read_text(encoding="utf-8"))
         checksum = _checksum(manifest) if isinstance(manifest, dict) else ""
     except OSError as error:
-        raise CheckpointError(f"no checkpoint here: {error.strerror}", file=file) from error
+        raise refused(f"no checkpoint here: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"not JSON: {error}", file=file) from error
+        raise refused(f"not JSON: {error}") from error
     version = manifest.get("format") if isinstance(manifest, dict) else None
     if type(version) is not int or version != FORMAT:
-        raise CheckpointError(f"format {version!r}, this version reads {FORMAT}", file=file, field="format")
+        raise refused(f"format {version!r}, this version reads {FORMAT}", "format")
     # Earlier versions wrote no checksum. Its own name may be what was changed, hence no others are known.
     strange = set(manifest) - {"format", "step", "torch", "parts", "sha256"}
     if strange or manifest.get("sha256", checksum) != checksum:
-        raise CheckpointError(
-            "damaged: its checksum differs from the recorded one", file=file, field="sha256"
-        )
+        raise refused("damaged: its checksum differs from the recorded one", "sha256")
     step, parts = manifest.get("step"), manifest.get("parts")
     if type(step) is not int or not 0 <= step < 10**12:
-        raise CheckpointError(f"no number of updates: {str(step)[:40]!r}", file=file, field="step")
+        raise refused(f"no number of updates: {str(step)[:40]!r}", "step")
     named = _NAME.fullmatch(path.name.removeprefix(".old-"))
     if named and int(named[1]) != step:
-        raise CheckpointError(f"is {step} in the folder {path.name}", file=file, field="step")
+        raise refused(f"is {step} in the folder {path.name}", "step")
     if not isinstance(parts, dict) or not {"rng", "extra"} <= set(parts):
-        raise CheckpointError(
-            "parts missing: at least rng and extra are in every checkpoint", file=file, field="parts"
-        )
+        raise refused("parts missing: at least rng and extra are in every checkpoint", "parts")
     return manifest
 
 
@@ -281,8 +274,8 @@ def _checksum(manifest: Mapping[str, Any]) -> str:
 
 
 def _read_part(path: Path, manifest: dict[str, Any], part: str) -> dict[str, Any]:
-    file = path / f"{part}.safetensors"
-    tensors: dict[str, Tensor] = {}
+    """The state of a module or an optimizer, the random states, or the caller's values."""
+    file, tensors = path / f"{part}.safetensors", {}
     try:
         entry = manifest["parts"][part]
         if "file" in entry:
@@ -291,16 +284,15 @@ def _read_part(path: Path, manifest: dict[str, Any], part: str) -> dict[str, Any
                 raise CheckpointError("damaged: its checksum differs from the recorded one", file=file)
             tensors = decode_tensors(content)
         state = decode(entry["state"], tensors)
+        if not isinstance(state, dict):
+            raise TypeError("no table of values")
     except OSError as error:
         raise CheckpointError(f"can't be read: {error.strerror}", file=file, field=part) from error
     except CheckpointError:
         raise
     except Exception as error:  # torch and the decoder raise much on what they did not write
-        raise CheckpointError(
-            f"can't be decoded: {error!r}"[:300], file=path / MANIFEST, field=part
-        ) from error
-    if not isinstance(state, dict):
-        raise CheckpointError("no table of values", file=path / MANIFEST, field=part)
+        what = f"can't be decoded: {error!r}"[:300]
+        raise CheckpointError(what, file=path / MANIFEST, field=part) from error
     return state
 
 
@@ -311,15 +303,69 @@ def _match(file: Path, own: Mapping[str, Any], saved: Mapping[str, Any]) -> None
             where = "the module" if name in own else "the checkpoint"
             raise CheckpointError(f"only {where} has it", file=file, field=str(name))
         mine, other = own[name], saved[name]
-        if not isinstance(other, Tensor) or mine.shape != other.shape or mine.dtype != other.dtype:
-            found = (
-                f"{other.dtype} {tuple(other.shape)}" if isinstance(other, Tensor) else type(other).__name__
-            )
-            raise CheckpointError(
-                f"saved as {found}, expected {mine.dtype} {tuple(mine.shape)}", file=file, field=name
-            )
+        is_tensor = isinstance(other, Tensor)
+        if not is_tensor or mine.shape != other.shape or mine.dtype != other.dtype:
+            found = f"{other.dtype} {tuple(other.shape)}" if is_tensor else type(other).__name__
+            what = f"saved as {found}, expected {mine.dtype} {tuple(mine.shape)}"
+            raise CheckpointError(what, file=file, field=name)
         if bad := int((~torch.isfinite(other)).sum()):
             raise CheckpointError(f"{bad} of {other.numel()} numbers are not finite", file=file, field=name)
+
+
+def encode(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
+    """Turn nested values into JSON; tensors and arrays go to `tensors` (copies on the CPU), named by their place.
+
+    Raises:
+        TypeError: naming the place of a value that can't be stored.
+    """
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, Mapping):
+        items = {key: encode(item, tensors, f"{name}.{key}") for key, item in value.items()}
+        plain = all(isinstance(key, str) for key in value) and TAG not in value
+        keys = [] if plain else encode(list(value), tensors, f"{name} (keys)")
+        return items if plain else {TAG: "dict", "keys": keys, "items": list(items.values())}
+    if isinstance(value, list):
+        return [encode(item, tensors, f"{name}.{index}") for index, item in enumerate(value)]
+    if isinstance(value, tuple):
+        return {TAG: "tuple", "items": encode(list(value), tensors, name)}
+    if isinstance(value, float):
+        # JSON knows no infinity. (A numpy float64 is a float too: hence the conversion.)
+        return float(value) if math.isfinite(value) else {TAG: "float", "value": repr(float(value))}
+    if not isinstance(value, Tensor | np.ndarray):
+        raise TypeError(f"{name}: a value of type {type(value).__name__} can't be stored")
+    kind = "tensor" if isinstance(value, Tensor) else "array"
+    unique, count = name, 1
+    while unique in tensors:  # {"a.b": x, "a": {"b": y}} gives two tensors one name
+        unique, count = f"{name}#{count}", count + 1
+    tensors[unique] = torch.as_tensor(value).detach().to("cpu", copy=True).contiguous()
+    return {TAG: kind, "value": unique}
+
+
+def decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
+    """What :func:`encode` was given (mappings as plain dicts).
+
+    Raises:
+        KeyError, TypeError, ValueError: if it is not such a value.
+    """
+    if isinstance(value, list):
+        return [decode(item, tensors) for item in value]
+    if not isinstance(value, dict):
+        return value
+    kind = value.get(TAG)
+    if kind is None:
+        return {key: decode(item, tensors) for key, item in value.items()}
+    if kind in ("float", "tensor", "array"):
+        held = value["value"]
+        return (
+            float(held) if kind == "float" else tensors[held] if kind == "tensor" else tensors[held].numpy()
+        )
+    items = decode(value["items"], tensors)
+    if kind == "dict":
+        return dict(zip(decode(value["keys"], tensors), items, strict=True))
+    if kind != "tuple":
+        raise ValueError(f"unknown kind {kind!r}")
+    return tuple(items)
 
 
 def _widened(module: nn.Module, saved: dict[str, Any]) -> dict[str, Any]:

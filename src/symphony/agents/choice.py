@@ -77,25 +77,23 @@ def choose(folder: Path, which: str = "") -> Path:
         ConfigError: if there is no such checkpoint.
         CheckpointError: if the last one can't be read.
     """
-    found = checkpoints(folder / "checkpoints")
+    found = {int(path.name[-12:]): path for path in checkpoints(folder / "checkpoints")}
     if not found:
         raise ConfigError(f"{folder}: the run has no checkpoint yet")
-    steps = {int(path.name[-12:]): path for path in found}
-    held = f"it has those of the steps {', '.join(map(str, steps))}"
+    last, held = max(found), f"it has those of the steps {', '.join(map(str, found))}"
     if named := re.fullmatch(r"(?:step-)?(\d+)", which):
-        if int(named[1]) not in steps:
+        if int(named[1]) not in found:
             raise ConfigError(f"{folder}: no checkpoint of step {int(named[1])}, {held}")
-        return steps[int(named[1])]
+        return found[int(named[1])]
     if which not in ("", "best", "last"):
         raise ConfigError(f"{folder}: '{which}' is no checkpoint; name best, last or a step, {held}")
-    best = None if which == "last" else best_of(found[-1])
-    if best is None:
-        if which == "best":
-            raise ConfigError(f"{folder}: the run was not validated, so that none is the best; {held}")
-        return found[-1]
-    if best.step not in steps:
-        raise CheckpointError(f"the best checkpoint, of step {best.step}, is gone; {held}", file=folder)
-    return steps[best.step]
+    best = None if which == "last" else best_of(found[last])
+    if best is None and which == "best":
+        raise ConfigError(f"{folder}: the run was not validated, so that none is the best; {held}")
+    step = last if best is None else best.step
+    if step not in found:
+        raise CheckpointError(f"the best checkpoint, of step {step}, is gone; {held}", file=folder)
+    return found[step]
 
 
 PREFIX = "pretrained:"

@@ -43,29 +43,17 @@ def _nowhere(state: Float[Tensor, "*b N 4"], valid: Bool[Tensor, "*b N"]) -> Boo
 
 
 class State(NamedTuple):
-    """The simulation state, all of it; leading dimensions [*b] are those of the batch.
+    """The simulation state, all of it; leading dimensions [*b] are those of the batch."""
 
-    Attributes:
-        scene: [*b] rows of the scene batch.
-        step: [*b] simulated steps since the first state.
-        stream: [*b] identity of the rollout.
-        state: [*b, N, 4] x, y, heading, speed.
-        valid: [*b, N] who is there.
-        goal: [*b, N] routes that agents follow, -1 for none.
-        progress: [*b, N] metres that they have come along them.
-        waiting: [*b, N] who has not entered yet; None where traffic is not open.
-        persona: [*b, N, 2] driving styles; None where they are not observed.
-    """
-
-    scene: Tensor
-    step: Tensor
-    stream: Tensor
-    state: Tensor
-    valid: Tensor
-    goal: Tensor
-    progress: Tensor
-    waiting: Tensor | None = None
-    persona: Tensor | None = None
+    scene: Tensor  # [*b] rows of the scene batch
+    step: Tensor  # [*b] simulated steps since the first state
+    stream: Tensor  # [*b] identity of the rollout
+    state: Tensor  # [*b, N, 4] x, y, heading, speed
+    valid: Tensor  # [*b, N] who is there
+    goal: Tensor  # [*b, N] routes that agents follow, -1 for none
+    progress: Tensor  # [*b, N] metres that they have come along them
+    waiting: Tensor | None = None  # [*b, N] who has not entered yet; None where traffic is not open
+    persona: Tensor | None = None  # [*b, N, 2] driving styles; None where they are not observed
 
 
 class DrivingEnv(EnvBase):

@@ -23,15 +23,11 @@ BESIDE = 2.5
 
 
 class MapEdge(NamedTuple):
-    """Where a map ends.
+    """Where a map ends."""
 
-    Attributes:
-        exits: [X, 4] ends of lanes that go nowhere: x, y and the direction of travel.
-        hull: [H, 3] outward normal and offset of the sides of the convex hull of all lanes, :data:`MARGIN` added: a
-            point p is beyond where ``normal @ p > offset`` for one of them.
-    """
-
-    exits: NDArray[np.float32]
+    exits: NDArray[np.float32]  # [X, 4] ends of lanes that go nowhere: x, y and the direction of travel
+    # [H, 3] outward normal and offset of the sides of the convex hull of all lanes, MARGIN added: a point p
+    # is beyond where normal @ p > offset for one of them
     hull: NDArray[np.float32]
 
 

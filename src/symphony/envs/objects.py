@@ -30,20 +30,12 @@ _PLACES = 1 << 22
 
 
 class Objects(NamedTuple):
-    """All agents of a scene at one step.
+    """All agents of a scene at one step."""
 
-    Attributes:
-        state: [M, A, 5] x, y, heading, velocity x, velocity y.
-        valid: [M, A].
-        size: [M, A, 2].
-        kind: [M, A] int64, ``AgentType``.
-        height: [M, A, 2] height and level, see :mod:`symphony.data.levels`; None where no scene has levels.
-    """
-
-    state: Tensor
-    valid: Tensor
-    size: Tensor
-    kind: Tensor
+    state: Tensor  # [M, A, 5] x, y, heading, velocity x, velocity y
+    valid: Tensor  # [M, A]
+    size: Tensor  # [M, A, 2]
+    # [M, A, 2] height and level, see symphony.data.levels; None where no scene has levels
     height: Tensor | None = None
 
     def others(self, index: Int[Tensor, "M N"]) -> Bool[Tensor, "M N A"]:
@@ -56,29 +48,17 @@ class Objects(NamedTuple):
 
 
 class Observers(NamedTuple):
-    """Agents that observe at a step.
+    """Agents that observe at a step."""
 
-    Attributes:
-        scene: [M] rows of the scene batch.
-        step: [M] logged step.
-        agent: [M, N] their rows among all agents.
-        state: [M, N, 5] x, y, heading, velocity x, velocity y.
-        size: [M, N, 2].
-        height: [M, N, 2] height and level; None where no scene has levels.
-        origin: [M, N, 2] positions in ``state``.
-        heading: [M, N] headings in ``state``.
-        speed: [M, N] along the heading, m/s.
-    """
-
-    scene: Tensor
-    step: Tensor
-    agent: Tensor
-    state: Tensor
-    size: Tensor
-    height: Tensor | None
-    origin: Tensor
-    heading: Tensor
-    speed: Tensor
+    scene: Tensor  # [M] rows of the scene batch
+    step: Tensor  # [M] logged step
+    agent: Tensor  # [M, N] their rows among all agents
+    state: Tensor  # [M, N, 5] x, y, heading, velocity x, velocity y
+    size: Tensor  # [M, N, 2]
+    height: Tensor | None  # [M, N, 2] height and level; None where no scene has levels
+    origin: Tensor  # [M, N, 2] positions in state
+    heading: Tensor  # [M, N] headings in state
+    speed: Tensor  # [M, N] along the heading, m/s
 
     @classmethod
     def of(cls, objects: Objects, scene: Tensor, step: Tensor, index: Tensor) -> Observers:
@@ -132,7 +112,7 @@ def objects_at(
     logged, valid = (
         table.flatten(0, 1).index_select(0, row) for table in (scenes.log_state, scenes.log_valid)
     )
-    size, kind = (table.index_select(0, scene) for table in (scenes.box_size, scenes.agent_type))
+    size = scenes.box_size.index_select(0, scene)
     valid = valid & (step <= scenes.last_step.index_select(0, scene))[:, None]
     height = None
     if scenes.agent_height.shape[1]:
@@ -146,7 +126,7 @@ def objects_at(
     wide = column[..., None].expand(*index.shape, 5)
     logged = pad(logged, (0, 0, 0, 1)).scatter(1, wide, simulated)[:, :agents]
     valid = pad(valid, (0, 1)).scatter(1, column, True)[:, :agents]
-    return Objects(logged, valid, size, kind, height)
+    return Objects(logged, valid, size, height)
 
 
 def everyone_at(
@@ -217,8 +197,7 @@ def entering(objects: Objects, index: Int[Tensor, "M N"], ready: Bool[Tensor, "M
     order = order.scatter(1, torch.where(ready, index, agents), slot)[:, :agents]
     row, slot = places(ready)
     height = None if objects.height is None else objects.height[row]
-    state, valid, size, kind = (part[row] for part in objects[:4])
-    some = Objects(state, valid, size, kind, height)
+    some = Objects(objects.state[row], objects.valid[row], objects.size[row], height)
     agent = index[row, slot]
     there = some.others(agent[:, None])[:, 0] & (order[row] < slot[:, None])
     own, own_size = objects.state[row, agent][:, None], objects.size[row, agent][:, None]

@@ -55,19 +55,15 @@ _CUT, _SLACK = 1.5, 3.0
 
 @dataclass(frozen=True)
 class RouteTable:
-    """Feasible routes of one vehicle from where it begins.
+    """Feasible routes of one vehicle from where it begins."""
 
-    Attributes:
-        points: [P, 2] float32 points of all routes, one route after the other, :data:`SPACING` apart from beside the
-            vehicle on.
-        count: [G] int64 points of each.
-        right: [G] bool the routes nearest to the logged trajectory; several where they part beyond its end.
-        logged: one of these, drawn uniformly from segment and agent alone; -1 where the vehicle is on no lane.
-    """
-
+    # [P, 2] float32 points of all routes, one route after the other, SPACING apart from beside the vehicle
+    # on
     points: NDArray[np.float32]
-    count: NDArray[np.int64]
+    count: NDArray[np.int64]  # [G] int64 points of each
+    # [G] bool the routes nearest to the logged trajectory; several where they part beyond its end
     right: NDArray[np.bool_]
+    # one of these, drawn uniformly from segment and agent alone; -1 where the vehicle is on no lane
     logged: int
 
     def line(self, route: int) -> NDArray[np.float32]:
@@ -85,13 +81,12 @@ def drivable(segment: RunSegment) -> float:
     return min(_FASTER * float(speed), _FASTEST) * (segment.num_steps - 1) * segment.dt
 
 
-def route_table(
-    segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 0, *, reach: float | None = None
-) -> RouteTable:
+def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 0) -> RouteTable:
     """Routes that an agent of a segment can take, and which of them it took (paper, section IV-B).
 
     They follow every branch for :data:`symphony.roadgraph.routes.HORIZON` metres, or as far as agents can drive in
-    the segment, and reach :data:`ONWARD` metres beyond what can be driven, unless the map ends.
+    the segment, and reach :data:`ONWARD` metres beyond what can be driven, unless the map ends. Where they can't be
+    built, a :class:`~symphony.errors.DataWarning` says so, and there are none.
 
     Args:
         segment: with the agent's log.
@@ -99,12 +94,22 @@ def route_table(
         agent: row of the segment.
         begin: step at which the agent comes in; routes begin with its first valid state from there on, of one that
             comes in later with the first on a lane.
-        reach: of :func:`drivable`, where that is known.
     """
+    steps, starts, first = begin + np.flatnonzero(segment.valid[agent, begin:]), [], 0
+    for first in steps.tolist() if begin else steps[:1].tolist():
+        if starts := _starts(segment, graph, agent, first):
+            break
+    reach, speed = drivable(segment), float(np.linalg.norm(segment.velocity[agent, first]))
+    horizon, length = max(HORIZON, reach), max(HORIZON, reach + ONWARD)
+    found = routes(graph, starts, horizon=horizon, onward=max(reach + ONWARD - horizon, 0.0))
     try:
-        first, lines = _agent_routes(segment, graph, agent, begin, reach)
-    except DataError as error:
-        warnings.warn(f"{error}; it has none", DataWarning, stacklevel=2)
+        lines = route_lines(graph, found, dict(starts), spacing=SPACING, length=length, speed=speed)[1]
+        if not all(np.isfinite(line).all() for line in lines):
+            raise ValueError("points that are not finite")
+    except (ValueError, IndexError, ArithmeticError) as error:
+        what = f"the routes of agent {int(segment.agent_id[agent])} can't be built: {error}; it has none"
+        where = DataError(what, segment=segment.segment_id, field="road.lanes")
+        warnings.warn(str(where), DataWarning, stacklevel=2)
         return NO_ROUTES
     if not lines:
         return NO_ROUTES
@@ -113,34 +118,6 @@ def route_table(
     draw = stream_of(f"route {segment.segment_id} {segment.agent_id[agent]}") % len(tied)
     count = np.array([len(line) for line in lines], np.int64)
     return RouteTable(np.concatenate(lines).astype(np.float32), count, right, int(tied[draw]))
-
-
-def _agent_routes(
-    segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 0, reach: float | None = None
-) -> tuple[int, list[NDArray[np.float64]]]:
-    """The step at which an agent's routes begin, and their lines; see :func:`route_table`.
-
-    Raises:
-        DataError: the routes cannot be built; names segment and agent.
-    """
-    steps = begin + np.flatnonzero(segment.valid[agent, begin:])
-    for first in steps if begin else steps[:1]:
-        if starts := _starts(segment, graph, agent, int(first)):
-            break
-    else:
-        return 0, []
-    reach = drivable(segment) if reach is None else reach
-    horizon = max(HORIZON, reach)
-    found = routes(graph, starts, horizon=horizon, onward=max(reach + ONWARD - horizon, 0.0))
-    length, speed = max(horizon, reach + ONWARD), float(np.linalg.norm(segment.velocity[agent, first]))
-    try:
-        _, lines = route_lines(graph, found, dict(starts), spacing=SPACING, length=length, speed=speed)
-        if not all(np.isfinite(line).all() for line in lines):
-            raise ValueError("points that are not finite")
-    except (ValueError, IndexError, ArithmeticError) as error:
-        message = f"the routes of agent {int(segment.agent_id[agent])} can't be built: {error}"
-        raise DataError(message, segment=segment.segment_id, field="road.lanes") from error
-    return int(first), lines
 
 
 def _starts(segment: RunSegment, graph: LaneGraph, agent: int, step: int) -> list[tuple[int, float]]:
@@ -162,12 +139,10 @@ def packed(tables: Sequence[RouteTable], least: int = 0) -> tuple[NDArray[Any], 
     has [N, G], 0 for padding; G is at least ``least``.
     """
     most = max([least, *(len(table.count) for table in tables)])
-    first, count = np.zeros((2, len(tables), most), np.int64)
-    begin = 0
-    for k, table in enumerate(tables):
-        count[k, : len(table.count)] = table.count
-        first[k, : len(table.count)] = begin + np.cumsum(table.count) - table.count
-        begin += len(table.points)
+    count = np.zeros((len(tables), most), np.int64)
+    for row, table in zip(count, tables, strict=True):
+        row[: len(table.count)] = table.count
+    first = (count.cumsum() - count.ravel()).reshape(count.shape) * (count > 0)
     return np.concatenate([np.zeros((0, 2), np.float32), *(t.points for t in tables)]), first, count
 
 
@@ -187,17 +162,11 @@ def logged_progress(
 
 
 class Routes(NamedTuple):
-    """Routes of the agents of some scenes, all points of a scene in one list.
+    """Routes of the agents of some scenes, all points of a scene in one list."""
 
-    Attributes:
-        point: [B, R, 2].
-        first: [B, N, G] int64 place in the list of the first point of each route.
-        length: [B, N, G] int64 points of each; 0 for padding.
-    """
-
-    point: Tensor
-    first: Tensor
-    length: Tensor
+    point: Tensor  # [B, R, 2]
+    first: Tensor  # [B, N, G] int64 place in the list of the first point of each route
+    length: Tensor  # [B, N, G] int64 points of each; 0 for padding
 
     def of(self, scene: Int[Tensor, " M"], goal: Int[Tensor, "M N"]) -> FollowedRoutes:
         """The routes that agents follow: none where there is no route of that number."""
@@ -227,17 +196,11 @@ class Routes(NamedTuple):
 
 
 class FollowedRoutes(NamedTuple):
-    """Some routes, such as the one that each agent follows; leading dimensions [*b], such as [M, N].
+    """Some routes, such as the one that each agent follows; leading dimensions [*b], such as [M, N]."""
 
-    Attributes:
-        point: [Q, 2] points of many routes.
-        begin: [*b] int64 place of the first point of each.
-        length: [*b] int64 points of each; 0 for none.
-    """
-
-    point: Tensor
-    begin: Tensor
-    length: Tensor
+    point: Tensor  # [Q, 2] points of many routes
+    begin: Tensor  # [*b] int64 place of the first point of each
+    length: Tensor  # [*b] int64 points of each; 0 for none
 
     def points(self, place: Int[Tensor, "*b K"] | int) -> Float[Tensor, "*b K 2"]:
         """Points at places of each route, or so many first ones; past the end the last one again, zeros for none."""
@@ -290,17 +253,11 @@ class FollowedRoutes(NamedTuple):
 
 
 class RouteWindow(NamedTuple):
-    """What agents see of their routes.
+    """What agents see of their routes."""
 
-    Attributes:
-        points: [M, N, W, 2] points, :data:`SPACING` apart.
-        exists: [M, N, W] which of them are there.
-        own: [M, N] int64 the one that is nearest to where the agent has come to, or the last but one.
-    """
-
-    points: Tensor
-    exists: Tensor
-    own: Tensor
+    points: Tensor  # [M, N, W, 2] points, SPACING apart
+    exists: Tensor  # [M, N, W] which of them are there
+    own: Tensor  # [M, N] int64 the one that is nearest to where the agent has come to, or the last but one
 
 
 def route_ahead(

@@ -21,10 +21,10 @@ from symphony.data.levels import Levels, agent_heights, levels_of
 from symphony.data.segment import LaneType, MarkType, Polylines, RunSegment
 from symphony.data.selection import interactive_agents
 from symphony.envs.edge import MapEdge, beyond
-from symphony.envs.routes import NO_ROUTES, Routes, drivable, packed, route_table
+from symphony.envs.routes import NO_ROUTES, Routes, packed, route_table
 from symphony.errors import DataError
+from symphony.geometry.nearest import spans
 from symphony.geometry.polylines import segments_of
-from symphony.geometry.spans import spans
 from symphony.roadgraph import LaneGraph
 from symphony.streams import stream_of
 
@@ -179,8 +179,8 @@ def scene(
     enter = there.argmax(1)
     tables = [NO_ROUTES] * len(chosen)
     if graph is not None:
-        pairs, reach = zip(chosen.tolist(), enter.tolist(), strict=True), drivable(segment)
-        tables = [route_table(segment, graph, agent, at, reach=reach) for agent, at in pairs]
+        pairs = zip(chosen.tolist(), enter.tolist(), strict=True)
+        tables = [route_table(segment, graph, agent, at) for agent, at in pairs]
     moving = segment.position[..., :2], segment.heading[..., None], segment.velocity
     levels = levels_of(segment)
     fields: dict[str, Any] = {

@@ -22,7 +22,7 @@ def box_corners(
     center: Float[Tensor, "*#batch 2"], heading: Float[Tensor, "*#batch"], size: Float[Tensor, "*#batch 2"]
 ) -> Float[Tensor, "*batch 4 2"]:
     """Corners counter-clockwise: front left, rear left, rear right, front right."""
-    local = _local_corners(size)
+    local = 0.5 * size[..., None, :] * constant(_CORNER_SIGNS, size.dtype, size.device)
     cos, sin = torch.cos(heading)[..., None], torch.sin(heading)[..., None]
     x, y = local[..., 0], local[..., 1]
     return center[..., None, :] + torch.stack((cos * x - sin * y, sin * x + cos * y), dim=-1)
@@ -72,18 +72,13 @@ def gap_between(
 ) -> Float[Tensor, "*batch"]:
     """:func:`box_gap` of boxes whose centres are ``x`` and ``y`` metres apart, seen from a."""
     pair = relation(x, y, heading_a, heading_b)
-    separation = _separations(pair, size_a, size_b)
+    separation, back = _separations(pair, size_a, size_b), (-pair.in_b[0], -pair.in_b[1])
     # Of two disjoint convex polygons the nearest points include a corner of one of them.
     apart = torch.minimum(
         _corner_distance(pair.in_a, pair.turn, size_a, size_b),
-        _corner_distance(_opposite(pair.in_b), (pair.turn[0], -pair.turn[1]), size_b, size_a),
+        _corner_distance(back, (pair.turn[0], -pair.turn[1]), size_b, size_a),
     )
     return torch.where(separation <= 0, separation, apart)
-
-
-def _local_corners(size: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 4 2"]:
-    signs = constant(_CORNER_SIGNS, size.dtype, size.device)
-    return 0.5 * size[..., None, :] * signs
 
 
 _Plane = tuple[Float[Tensor, "*#b"], Float[Tensor, "*#b"]]
@@ -123,10 +118,6 @@ def turned(x: Float[Tensor, "*#b"], y: Float[Tensor, "*#b"], heading: Float[Tens
     """A vector along and across a heading."""
     cos, sin = torch.cos(heading), torch.sin(heading)
     return cos * x + sin * y, cos * y - sin * x
-
-
-def _opposite(plane: _Plane) -> _Plane:
-    return -plane[0], -plane[1]
 
 
 def _separations(pair: _Pair, size_a: Float[Tensor, "*#b 2"], size_b: Float[Tensor, "*#b 2"]) -> Tensor:

@@ -1,4 +1,4 @@
-"""The smallest of each row: on the CPU by NumPy's vectorised selection, elsewhere by one ``topk``."""
+"""The smallest of each row: on the CPU by NumPy's vectorised selection, elsewhere by one ``topk``; and ranges."""
 
 from __future__ import annotations
 
@@ -30,6 +30,12 @@ def places(flags: Bool[Tensor, "M N"]) -> tuple[Int[Tensor, " P"], Int[Tensor, "
         return row, column
     row, column = (torch.arange(size, device=flags.device) for size in flags.shape)
     return row.repeat_interleave(len(column)), column.repeat(len(row))
+
+
+def spans(begin: NDArray[np.int64] | int, length: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The numbers from ``begin`` on, ``length`` [R] of each, one after the other."""
+    before = length.cumsum() - length
+    return np.arange(length.sum()) + np.repeat(begin - before, length)
 
 
 def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:

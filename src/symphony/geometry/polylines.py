@@ -15,13 +15,10 @@ from symphony.geometry.nearest import on_host
 
 NO_BOUNDARY = -1e6
 """Signed distance, in metres, where a scene has no boundary at all: nothing is off the road there."""
-
 CLOSED_WITHIN = 1e-3
 """Metres between the ends of two lines (or of one line) below which they count as joined."""
-
 _BLOCK = 1 << 18
 """Distances held at a time on the CPU, so that the temporaries stay in the cache."""
-
 _FAR = 1e15
 """Offset of a segment that is not there."""
 
@@ -136,14 +133,10 @@ def _corner_sign(
     index = index.clamp(min=0)
     other = _Side(points, _take(start, index), _take(end, index))
     first, second = (here, other) if ahead else (other, here)
-    left = _cross(first.direction, second.direction) > 0
-    one, two = here.sign, other.sign
+    a, b, one, two = first.direction, second.direction, here.sign, other.sign
+    left = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0] > 0
     both = torch.where(left, torch.maximum(one, two), torch.minimum(one, two))
     return torch.where(exists, both, one)
-
-
-def _cross(a: Float[Tensor, "*b 2"], b: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _take(values: Float[Tensor, "B E 2"], index: Int[Tensor, "B M"]) -> Float[Tensor, "B M 2"]:
@@ -158,8 +151,13 @@ def _nearest_segment(
 ) -> Int[Tensor, "B M"]:
     """Index [B, M] of the nearest valid segment."""
     batch, count, _ = points.shape
-    # Coordinates relative to a point of the map keep float32 rounding well below a millimetre.
-    center = _middle(start, valid)
+    # Coordinates relative to a point of the map keep float32 rounding well below a millimetre: halfway between the
+    # outermost valid starts, 0 where there are none, so that no position has a say in it.
+    low, high = (
+        start.masked_fill(~valid[..., None], torch.inf),
+        start.masked_fill(~valid[..., None], -torch.inf),
+    )
+    center = (0.5 * (low.amin(1, keepdim=True) + high.amax(1, keepdim=True))).nan_to_num(0.0)
     x, y = (points - center)[..., None].unbind(2)
     axes = _segment_axes(start, end, valid, center)[:, :, None]
     group, most = batch, count
@@ -175,14 +173,6 @@ def _nearest_segment(
         side = torch.addcmul(across, x[part], unit_y).addcmul_(y[part], unit_x, value=-1)
         result[part] = beyond.addcmul_(side, side).argmin(-1)
     return result
-
-
-def _middle(start: Float[Tensor, "B E 2"], valid: Bool[Tensor, "B E"]) -> Float[Tensor, "B 1 2"]:
-    """Halfway between the outermost valid starts; 0 where there are none. No position has a say in it."""
-    there = valid[..., None]
-    low = start.masked_fill(~there, torch.inf).amin(1, keepdim=True)
-    high = start.masked_fill(~there, -torch.inf).amax(1, keepdim=True)
-    return (0.5 * (low + high)).nan_to_num(0.0)
 
 
 def _segment_axes(

@@ -31,7 +31,6 @@ from symphony.envs.routes import (
     FollowedRoutes,
     RouteTable,
     RouteWindow,
-    drivable,
     logged_progress,
     route_table,
 )
@@ -108,8 +107,7 @@ def fit_experts(
         last = mask.shape[1] - 1 - mask.flip(1).int().argmax(1)
         which = torch.arange(len(chosen))
         away = states[which, last, :2] - torch.from_numpy(segment.position[chosen, last.numpy(), :2])
-        reach = drivable(segment)
-        tables = tuple(route_table(segment, graph, int(row), reach=reach) for row in chosen) if routes else ()
+        tables = tuple(route_table(segment, graph, int(row)) for row in chosen) if routes else ()
         come = np.zeros((len(chosen), 0), np.float32)
         if routes:
             # Along what was fitted, as that is what is learned from; it exists from the first valid state on.

@@ -14,16 +14,12 @@ from symphony.roadgraph.lines import Bools, Indices, Near, turn_between
 
 LATERAL = 3.0
 """Metres from a centre line within which a vehicle can be on a lane."""
-
 TURN = math.pi / 3
 """Largest angle between a vehicle and its lane."""
-
 MARGIN = 1.5
 """Metres by which a lane may be farther away than the nearest and is still one that a vehicle may be on."""
-
 _TIE = 0.25
 """Metres by which distances must differ to decide between lanes before the heading does."""
-
 _TURN_TIE = 1e-3
 
 

@@ -9,16 +9,14 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from symphony.geometry.spans import spans
+from symphony.geometry.nearest import spans
 from symphony.roadgraph.graph import LaneGraph
 from symphony.roadgraph.lines import Bools, Indices, Reals, turn_between
 
 REACH = 2.0
 """Metres from a region's centre line, or from its entry point, within which a trajectory is on it."""
-
 APART = 0.5
 """Metres by which every alternative must be farther away before a region counts as chosen."""
-
 TURN = math.pi / 4
 """Largest angle between a vehicle on a region and the region."""
 

@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from symphony.errors import DataError
-from symphony.roadgraph.lines import Bools, Indices, LineIndex, Reals
+from symphony.roadgraph.lines import Bools, Indices, LineIndex, Reals, arc_lengths
 
 BIKE_LANE = 3
 """The lane type that vehicles keep off (see ``LaneType``)."""
@@ -77,7 +77,7 @@ class LaneGraph:
     def __init__(self, road: Any, *, exclude: Collection[int] = (BIKE_LANE,)) -> None:
         points = np.asarray(road.lanes.points, dtype=np.float64)[:, :2]
         self.lines = [_distinct(points[a:b]) for a, b in pairwise(road.lanes.offsets)]
-        self.arc = [_arc(line) for line in self.lines]
+        self.arc = [arc_lengths(line) for line in self.lines]
         self.length: Reals = np.array([arc[-1] for arc in self.arc], dtype=np.float64)
         self.usable: Bools = ~np.isin(np.asarray(road.lane_type), list(exclude)) & (self.length > 0)
         self.successors = self._adjacency(road.successors, "road.successors")
@@ -141,7 +141,3 @@ class LaneGraph:
 def _distinct(line: Reals) -> Reals:
     keep = np.concatenate(([True], (line[1:] != line[:-1]).any(1)))[: len(line)]
     return line[keep]
-
-
-def _arc(line: Reals) -> Reals:
-    return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))

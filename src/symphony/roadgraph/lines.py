@@ -74,6 +74,14 @@ class LineIndex:
         return self._heading[np.clip(segment, self._first[line], self._first[line + 1] - 1)]
 
 
+def arc_lengths(line: Reals) -> Reals:
+    """Metres [P] from the beginning of a line to each of its points."""
+    way = line[1:] - line[:-1]
+    arc = np.zeros(len(line))
+    np.cumsum(np.hypot(way[:, 0], way[:, 1]), out=arc[1:])
+    return arc
+
+
 def line_strings(lines: Sequence[Reals]) -> NDArray[Any]:
     """[lines] shapely geometries of polylines [P_k, 2], all made at once."""
     owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])

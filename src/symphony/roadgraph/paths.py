@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from symphony.roadgraph.graph import LaneGraph
-from symphony.roadgraph.lines import Reals
+from symphony.roadgraph.lines import Reals, arc_lengths
 
 CHORD = 3.0
 """Metres of a piece of a line that has a direction, and over which a change of direction is measured."""
@@ -92,14 +92,6 @@ def at(line: Reals, arc: Reals, places: Reals) -> Reals:
     return found
 
 
-def arc_lengths(line: Reals) -> Reals:
-    """Metres [P] from the beginning of a line to each of its points."""
-    way = line[1:] - line[:-1]
-    arc = np.zeros(len(line))
-    np.cumsum(np.hypot(way[:, 0], way[:, 1]), out=arc[1:])
-    return arc
-
-
 def followed(graph: LaneGraph, before: int, lane: int) -> Reals:
     """The centre line of a lane as one follows it from the end of the lane before, without that end itself.
 
@@ -150,13 +142,3 @@ def gentle(graph: LaneGraph, lane: int) -> bool:
     if lane not in graph.gentle:
         graph.gentle[lane] = sharpest(graph.lines[lane]) < GENTLE
     return graph.gentle[lane]
-
-
-def own_sharpest(graph: LaneGraph, lanes: Sequence[int]) -> float:
-    """What :func:`sharpest` gives for lanes themselves, were each to begin where the one before it ends."""
-    parts, end = [graph.lines[lanes[0]]], graph.lines[lanes[0]][-1]
-    for lane in lanes[1:]:
-        line = graph.lines[lane] - graph.lines[lane][0] + end
-        parts.append(line)
-        end = line[-1]
-    return sharpest(distinct(np.concatenate(parts)))

@@ -29,10 +29,8 @@ from symphony.roadgraph.paths import (
 
 HORIZON = 240.0
 """Metres ahead up to which routes take every branch: 10 s at 20 m/s and a margin."""
-
 LIMIT = 200
 """Most routes a vehicle gets."""
-
 MAX_LANES = 500
 """Most lanes of a route."""
 
@@ -291,16 +289,12 @@ def route_lines(
             continue
         points = resampled(line, spacing, length)
         # Lines that are the same have last points in one cell, or in cells side by side.
-        cell = len(points), *np.floor(points[-1] / SAME).astype(int).tolist()
-        close = (
-            k
-            for x in (-1, 0, 1)
-            for y in (-1, 0, 1)
-            for k in ends.get((cell[0], cell[1] + x, cell[2] + y), ())
-        )
-        if any(np.hypot(*(lines[k] - points).T).max() < SAME for k in close):
+        count, (x, y) = len(points), np.floor(points[-1] / SAME).astype(int).tolist()
+        around = ((count, i, j) for i in (x - 1, x, x + 1) for j in (y - 1, y, y + 1))
+        close = (lines[k] for cell in around for k in ends.get(cell, ()))
+        if any(np.hypot(*(line - points).T).max() < SAME for line in close):
             continue
-        ends.setdefault(cell, []).append(len(lines))
+        ends.setdefault((count, x, y), []).append(len(lines))
         kept.append(route)
         lines.append(points)
     return kept, lines
@@ -344,9 +338,9 @@ def route_errors(
         path: T >= 1 places in the order of time.
     """
     path = np.asarray(path, np.float64)
-    way = np.hypot(*np.diff(path, axis=0).T).sum()
+    driven = np.hypot(*np.diff(path, axis=0).T).sum()
     spacing = max(_TIE, *(float(np.hypot(*(line[1] - line[0]))) for line in lines))
-    most = min(max(map(len, lines)), int((1.5 * way + _SLACK) / spacing) + 2)
+    most = min(max(map(len, lines)), int((1.5 * driven + _SLACK) / spacing) + 2)
     # Shorter ones end with their last point again. Routes that part farther on are one here.
     different: dict[bytes, int] = {}
     number = [different.setdefault(line[:most].tobytes(), len(different)) for line in lines]
@@ -357,7 +351,11 @@ def route_errors(
     twice = _returns(padded, spacing)
     errors = np.empty(len(padded))
     for block in np.array_split(np.flatnonzero(~twice), max(1, len(padded) // 16)):
-        errors[block] = _away(padded[block], path).min(-1).mean(-1)
+        way, start = np.diff(padded[block], axis=1), padded[block, None, :-1]
+        length = np.hypot(way[..., 0], way[..., 1])
+        direction = way / np.maximum(length, np.finfo(np.float64).tiny)[..., None]
+        away = to_pieces(start, direction[:, None], length[:, None], path[None, :, None])[2]
+        errors[block] = away.min(-1).mean(-1)
     if twice.any():
         same = np.broadcast_to(path, (int(twice.sum()), *path.shape))
         places = stations_along(padded[twice], same, np.ones(same.shape[:2], bool))
@@ -375,14 +373,6 @@ def _returns(lines: Float[NDArray[np.float64], "R P 2"], spacing: float) -> Bool
     # Padding repeats the end of a line, and is no return to it.
     moves = (lines[:, second] != lines[:, second - 1]).any(-1)
     return ((np.hypot(away[..., 0], away[..., 1]) < _RETURN_WIDTH) & moves).any(-1)
-
-
-def _away(lines: Float[NDArray[np.float64], "R P 2"], path: Reals) -> Float[NDArray[np.float64], "R T P-1"]:
-    """Metres from points of a path to the pieces of lines."""
-    way = np.diff(lines, axis=1)
-    length = np.hypot(way[..., 0], way[..., 1])
-    direction = way / np.maximum(length, np.finfo(np.float64).tiny)[..., None]
-    return to_pieces(lines[:, None, :-1], direction[:, None], length[:, None], path[None, :, None])[2]
 
 
 def ground_truth_routes(
