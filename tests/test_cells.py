@@ -19,9 +19,9 @@ from symphony.envs import ObservationConfig, SceneBatch, collate, points, scene
 from symphony.envs.flags import collision_flags, offroad_flags, road_distance
 from symphony.envs.objects import Objects, Observers, objects_at
 from symphony.envs.points import nearest_points, observed_points
-from symphony.envs.tables import Tables
+from symphony.envs.scene import Tables
 from symphony.geometry import NO_BOUNDARY, segments_of
-from symphony.geometry.cells import EdgeCells, PointCells
+from symphony.geometry.cells import PointCells
 from symphony.geometry.nearest import nearest, smallest
 
 FEW = ObservationConfig(num_objects=4, num_points=60)
@@ -114,23 +114,6 @@ def test_road_distances_and_flags_are_those_among_all_edges(scenes: SceneBatch) 
 
 
 @pytest.mark.usefixtures("at_once")
-@pytest.mark.parametrize("reach", [0.3, 2.0])
-def test_cells_that_edges_pass_through_have_no_side(scenes: SceneBatch, reach: float) -> None:
-    # Where a cell's side could be wrong: beside edges of every direction and around their corners.
-    rng = torch.Generator().manual_seed(5)
-    row = torch.arange(len(scenes) - 1)
-    start, end = scenes.edge_start[:-1], scenes.edge_end[:-1]
-    share = torch.rand(*start.shape[:2], 12, 1, generator=rng).round(decimals=1)  # some at the ends
-    along = start[:, :, None] + share * (end - start)[:, :, None]
-    where = (along + reach * torch.randn(along.shape, generator=rng)).flatten(1, 2)
-    tables = Tables(scenes, FEW)
-    flags = offroad_flags(scenes, row, where, tables)
-    expected = oracle.road_distance(scenes, row, where)
-    sure = expected.abs() > 1e-4
-    assert torch.equal(flags[sure], (expected > 0)[sure])
-
-
-@pytest.mark.usefixtures("at_once")
 @pytest.mark.parametrize("seed", range(4))
 def test_acute_corners_have_the_side_that_the_distance_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -162,18 +145,6 @@ def test_acute_corners_have_the_side_that_the_distance_says(seed: int) -> None:
     # Whoever is alone at a corner is on the same side of it.
     alone = [offroad_flags(batch, row, place, tables) for place in where[:, :300].split(1, 1)]
     assert torch.equal(torch.cat(alone, 1), flags[:, :300])
-
-
-@pytest.mark.usefixtures("at_once")
-def test_the_gradient_of_a_road_distance_is_that_among_all_edges(scenes: SceneBatch) -> None:
-    row, where = places(scenes, 10, seed=3)
-    there = [where.clone().requires_grad_() for _ in range(2)]
-    road_distance(scenes, row, there[0], Tables(scenes, FEW)).sum().backward()
-    oracle.road_distance(scenes, row, there[1]).sum().backward()
-    same = (there[0].grad - there[1].grad).norm(dim=-1) < 1e-4
-    # Where two edges are equally near, either gradient will do.
-    assert same.float().mean() > 0.98
-    assert (there[0].grad[row < len(scenes) - 1].norm(dim=-1) > 0.99).float().mean() > 0.95
 
 
 @pytest.mark.usefixtures("at_once")
@@ -266,46 +237,6 @@ def test_the_smallest_are_the_first_of_a_stable_sort(
     known = np.isfinite(values[np.arange(rows)[:, None], expected])
     np.testing.assert_array_equal(finite[:, : expected.shape[1]], known)
     assert not finite[:, expected.shape[1] :].any()
-
-
-def test_ties_of_one_row_do_not_make_up_for_numbers_that_another_lacks() -> None:
-    values = np.array([[1, 1, 1, 1], [np.nan, np.nan, 2, np.nan]], np.float32)
-    assert smallest(values, 2).tolist() == [0, 1, 4, 6]
-
-
-@pytest.mark.parametrize("shift", [0.0, 3e4])
-def test_lists_hold_every_element_that_can_be_nearest(shift: float) -> None:
-    rng = np.random.default_rng(7)
-    line = (np.cumsum(rng.normal(0, 2, (900, 2)), 0) + shift).astype(np.float32)
-    start, end, number, k = line[:-1], line[1:], np.arange(899), 20
-    near_points = PointCells(*line.T.copy()[:, None], k)
-    following = np.where(number < 898, number + 1, -1)
-    near_edges = EdgeCells(start, end, np.ones((1, 899), bool), number - 1, following)
-    for cells in (near_points, near_edges):
-        columns, count = int(cells.columns[0]), len(cells.begin)
-        cell = rng.integers(0, count, 300)
-        assert cells.listed(np.zeros_like(cell), cell).all()
-        corner = np.stack([cell % columns, cell // columns], -1) + rng.integers(0, 2, (300, 2)) * (1 - 1e-9)
-        place = np.array([cells.x[0], cells.y[0]]) + cells.side[0] * corner
-        for c, where in zip(cell, place, strict=True):
-            listed = set(cells.items[cells.begin[c] : cells.begin[c] + cells.count[c]].tolist())
-            if cells is near_points:
-                wanted = np.argsort(np.linalg.norm(line.astype(float) - where, axis=-1))[:k]
-            else:
-                along = (end - start).astype(float)
-                share = np.clip(((where - start) * along).sum(-1) / (along**2).sum(-1), 0, 1)
-                wanted = [np.linalg.norm(start + share[:, None] * along - where, axis=-1).argmin()]
-            assert listed.issuperset(np.asarray(wanted).tolist())
-        assert cells.count[cell].mean() < 0.5 * len(line)
-
-
-def test_maps_without_elements_have_no_cells() -> None:
-    none, three = np.full((2, 3), np.inf, np.float32), np.zeros((1, 3), np.float32)
-    assert len(PointCells(none, none, 1).begin) == len(PointCells(three, three, 2).begin) == 0
-    assert len(PointCells(three, three, 1).begin) > 0
-    ends = np.zeros((4, 2), np.float32)
-    cells = EdgeCells(ends, ends, np.zeros((2, 2), bool), np.full(4, -1), np.full(4, -1))
-    assert (cells.locate(np.array([0, 1]), np.zeros(2), np.zeros(2)) == -1).all()
 
 
 def test_huge_maps_have_larger_cells() -> None:

@@ -19,14 +19,13 @@ from tensordict.nn import TensorDictSequential
 from helpers_losses import CASES, LOGGED, ROWS, SCENES, batch_of, losses, searched, spec
 from helpers_runs import same_weights, stopped, tiny, weights
 from helpers_segments import crossing, straight_road
-from helpers_steps import assert_same_step
 from helpers_store import fill
 from symphony import keys
 from symphony.agents import build_agent
 from symphony.collectors import KeepBest, PruningRule, Systematic
 from symphony.config import EvaluateConfig, MGAILConfig
 from symphony.data.store import SegmentStore
-from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
+from symphony.envs import DrivingEnv
 from symphony.evaluation import evaluate
 from symphony.modules import SeededNoise
 from symphony.recipes import train
@@ -53,13 +52,6 @@ def never_waiting() -> Iterator[None]:
         yield
     finally:
         torch.cuda.set_sync_debug_mode("default")
-
-
-def test_waiting_is_refused() -> None:
-    number = torch.ones((), device=CUDA)
-    with pytest.raises(RuntimeError, match="synchroniz"), never_waiting():
-        number.item()
-    assert number.item() == 1
 
 
 @pytest.mark.parametrize("space", ["bicycle", "displacement", "histogram"])
@@ -130,25 +122,6 @@ def test_losses_and_their_gradients(name: str, space: str) -> None:
             torch.testing.assert_close(gradients[key], value, atol=1e-4, rtol=1e-3, msg=key)
         for key, value in here.items():
             torch.testing.assert_close(there[key], value, atol=1e-4, rtol=1e-3, msg=key)
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the compiler's own
-@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()], ids=["bicycle", "displacement"])
-@torch.no_grad()
-def test_a_compiled_step_is_the_step(dynamics: Any) -> None:
-    torch.compiler.reset()
-    config = ObservationConfig(num_objects=3, num_points=2000, clearance=True, foresight=(0.5,))
-    env = DrivingEnv(SCENES.to(CUDA), dynamics, config)
-    start = env.start(torch.tensor([0, 1], device=CUDA))
-    action = torch.tensor([[80, 60], [75, 70]], device=CUDA)
-    start.set(
-        keys.ACTION,
-        action if dynamics.discrete else action[..., None] / torch.tensor([50, 500.0], device=CUDA),
-    )
-    plain = env._step(start)
-    env.compile(fullgraph=True)
-    compiled = env._step(start)
-    assert_same_step(compiled, plain, atol=1e-3)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,8 @@
-"""What an accelerator would compute of a state is what the CPU, which looks only where it must, makes of it."""
+"""What an accelerator or a compiler makes of a state is what the CPU, which looks only where it must, makes of it."""
 
 from __future__ import annotations
 
+import pickle
 import sys
 from dataclasses import replace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDictBase, assert_close
 from torch import Tensor
 
 from helpers_losses import CASES, ROWS, SCENES, batch_of, losses, searched, spec
@@ -16,8 +18,23 @@ from helpers_segments import crossing, ring, straight_road
 from symphony import keys
 from symphony.agents import build_agent
 from symphony.collectors import KeepBest, PruningRule, Systematic
-from symphony.envs import DrivingEnv, ObservationConfig, collate, scene
+from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
+from symphony.envs.edge import map_edge
 from symphony.roadgraph import LaneGraph
+
+IN_ANY_ORDER = ("objects", "objects_mask", "points", "points_mask", "gap", "gap_ahead")
+"""Entries of elements that are seen, in the scene's order on the CPU and in any order elsewhere or compiled."""
+
+
+def assert_same_step(found: TensorDictBase, expected: TensorDictBase, *, atol: float) -> None:
+    """What came of one step is what came of the other, whatever the order of elements that are seen."""
+    assert set(found.keys(True, True)) == set(expected.keys(True, True))
+    for key in expected.keys(True, True):
+        one, other = found[key], expected[key]
+        if key[-1] in IN_ANY_ORDER:
+            one, other = one.double().sum(2), other.double().sum(2)
+        torch.testing.assert_close(one, other, atol=atol, rtol=0)
+
 
 EVERYTHING: dict[str, Any] = {
     "route": True,
@@ -130,3 +147,52 @@ def test_a_device_finds_the_same(rule: PruningRule, monkeypatch: pytest.MonkeyPa
     for key in (keys.STATE, keys.ACTION, keys.VALID):
         assert torch.equal(there.trajectories[key], found.trajectories[key])
     torch.testing.assert_close(there.totals, found.totals, atol=1e-4, rtol=0)
+
+
+SEES = ObservationConfig(num_objects=3, num_points=60, clearance=True, foresight=(0.5,))
+
+
+@pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
+@torch.no_grad()
+def test_a_compiled_step_is_the_step() -> None:
+    torch.compiler.reset()
+    segments = [straight_road(), crossing(6)]
+    scenes = [scene(s, [0, 1], edge=map_edge(LaneGraph(s.road))) for s in segments]
+    env = DrivingEnv(collate(scenes), Bicycle(), SEES)
+    assert env.open_traffic
+    start = env.start(torch.tensor([0, 1])).set(keys.ACTION, torch.tensor([[80, 60], [75, 70]]))
+    plain = env._step(start)
+    env.compile(backend="eager", fullgraph=True)
+    compiled = env._step(start)
+    assert_same_step(compiled, plain, atol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
+@torch.no_grad()
+def test_an_environment_is_compiled_where_it_is_and_its_copies_are_not() -> None:
+    torch.compiler.reset()
+    env = DrivingEnv(
+        collate([scene(straight_road(), [0, 1])]), Displacement(), ObservationConfig.nothing(), seed=0
+    )
+    plain = env.rollout(4)
+    calls = []
+
+    def backend(graph: torch.fx.GraphModule, _: object) -> Any:
+        calls.append(graph)
+        return graph.forward
+
+    env.compile(backend=backend, fullgraph=True)
+    # Again is not twice; and a batch without dimensions, as rollouts have it, compiles, too.
+    env.compile(backend=backend, fullgraph=True)
+    env.set_seed(0)
+    torch.manual_seed(0)
+    compiled = env.rollout(4)
+    assert len(calls) == 1
+    assert plain.shape == compiled.shape
+    copy = pickle.loads(pickle.dumps(env))  # noqa: S301 - just pickled
+    for tried in (env, copy):
+        torch.manual_seed(0)
+        tried.set_seed(0)
+        assert_close(tried.rollout(4), compiled, rtol=0, atol=1e-5)
+    assert len(calls) == 1
+    assert copy._step.__func__ is DrivingEnv._step

@@ -25,8 +25,7 @@ from symphony.envs.objects import Observers
 from symphony.envs.observation import OBJECT_FEATURES, SELF_FEATURES, ObservationConfig
 from symphony.envs.points import observed_lights
 from symphony.envs.routes import ALONG_FEATURES, POINTS, ROUTE_FEATURES, SPACING, RouteWindow, along_route
-from symphony.envs.scene import collate
-from symphony.envs.tables import Tables
+from symphony.envs.scene import Tables, collate
 from symphony.geometry.frames import rotate
 from symphony.learning import SceneDataset
 from symphony.recipes import train

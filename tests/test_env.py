@@ -1,10 +1,14 @@
-"""The driving environment: TorchRL's own checks and our contracts."""
+"""The driving environment: TorchRL's own checks and our contracts; what is asked for is observed and nothing else."""
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -13,7 +17,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import BatchSizeTransform
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
-from helpers_segments import crossing, hide, straight_road
+from helpers_segments import crossing, straight_road
 from symphony import keys
 from symphony.data.segment import Polylines, RunSegment
 from symphony.envs import (
@@ -25,6 +29,12 @@ from symphony.envs import (
     collate,
     scene,
 )
+from symphony.envs import flags as module
+from symphony.envs.flags import collision_flags
+from symphony.envs.objects import Objects
+from symphony.envs.observation import observe_states
+from symphony.errors import ConfigError
+from symphony.roadgraph import LaneGraph
 
 FEW = ObservationConfig(num_objects=4, num_points=60)
 ALL = ObservationConfig(num_objects=16, num_points=4000)
@@ -71,15 +81,6 @@ def test_a_fixed_batch_runs_in_torchrls_collector() -> None:
     assert batches[0]["next", "done"].sum(1).flatten().tolist() == [1, 1, 1]
 
 
-def test_step_does_not_touch_its_input() -> None:
-    env = make_env()
-    start = env.start(torch.tensor([0, 1]))
-    start.set(keys.ACTION, actions(env, (2,)))
-    before = start.clone()
-    env.step(start)
-    assert (start.exclude("next") == before).all()
-
-
 def test_episodes_end_with_their_own_log() -> None:
     env = make_env(straight_road(steps=21), straight_road(steps=31, seed=1))
     out = run(env, env.start(torch.tensor([0, 1])), actions(env, (2, 30)))
@@ -104,48 +105,6 @@ def test_partial_reset_keeps_the_rest() -> None:
     fresh = env.reset(state.clone().set("_reset", mask), set_state=False)
     assert fresh["step"].flatten().tolist() == [0, 5, 5]
     assert (fresh[1:] == state[1:].select(*fresh.keys(True, True))).all()
-
-
-def test_a_state_can_be_started_from() -> None:
-    env = make_env()
-    plan = actions(env, (2, 10))
-    whole = run(env, env.start(torch.tensor([0, 1])), plan)
-    middle = env.reset(whole[:, 4].exclude(keys.REWARD), set_state=True)
-    tail = run(env, middle, plan[:, 5:])
-    assert (tail == whole[:, 5:]).all()
-
-
-@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
-def test_a_rollout_is_the_same_in_any_batch(dynamics: Any) -> None:
-    alone = make_env(straight_road(), dynamics=dynamics)
-    among = make_env(crossing(7), straight_road(), straight_road(8, steps=61, seed=5), dynamics=dynamics)
-    plan = actions(alone, (1, 20))
-    one = run(alone, alone.start(torch.tensor([0]), 6), plan)
-    wide = run(
-        among,
-        among.start(torch.tensor([[2, 1], [0, 0]]), torch.tensor([[1, 6], [7, 8]])),
-        plan.expand(2, 2, 20, *plan.shape[2:]),
-    )[0, 1]
-    for key in one.keys(True, True):
-        if key != "scene":
-            assert _same_elements(key, one[key][0], wide[key]), key
-
-
-def _same_elements(key: Any, a: torch.Tensor, b: torch.Tensor) -> bool:
-    """Equality bit by bit; the order of seen elements means nothing, so sets are compared by their sorted sums."""
-    if isinstance(key, tuple) and key[-1] in {"points", "objects"}:
-        return torch.equal(a.double().sum(-2), b.double().sum(-2)) or torch.allclose(
-            a.double().sum(-2), b.double().sum(-2), atol=1e-9
-        )
-    if isinstance(key, tuple) and key[-1].endswith("_mask"):
-        return torch.equal(a.sum(-1), b.sum(-1))
-    return torch.equal(a, b)
-
-
-def test_rollouts_of_a_scene_have_streams_of_their_own() -> None:
-    env = make_env(straight_road(), straight_road(seed=1))
-    streams = env.start(torch.arange(2).repeat_interleave(500), torch.arange(500).repeat(2))["stream"]
-    assert streams.unique().numel() == 1000
 
 
 def moved(segment: RunSegment, angle: float, x: float, y: float) -> RunSegment:
@@ -189,15 +148,6 @@ def test_moving_the_world_changes_nothing_an_agent_sees(dynamics: Any) -> None:
         torch.testing.assert_close(a[key].mean(-2), b[key].mean(-2), atol=2e-4, rtol=0)
 
 
-def test_padding_changes_nothing_an_agent_sees() -> None:
-    small, large = straight_road(), crossing(9)
-    lone, padded = make_env(small, config=ALL), make_env(small, large, config=ALL)
-    a, b = lone.start(torch.tensor([0])), padded.start(torch.tensor([0]))
-    for key in (keys.OWN, keys.OBJECTS, keys.POINTS):
-        torch.testing.assert_close(a[key].double().sum(-2), b[key].double().sum(-2), atol=1e-6, rtol=0)
-    assert torch.equal(a[keys.POINTS_MASK].sum(-1), b[keys.POINTS_MASK].sum(-1))
-
-
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
 def test_padded_interactive_agents_neither_act_nor_matter(dynamics: Any) -> None:
     two, three = scene(crossing(6), [0, 1]), scene(straight_road(4), [0, 1, 2])
@@ -213,66 +163,6 @@ def test_padded_interactive_agents_neither_act_nor_matter(dynamics: Any) -> None
     torch.testing.assert_close(a[keys.OBJECTS].sum(-2), b[keys.OBJECTS][:, :, :2].sum(-2))
     assert (b[keys.STATE][:, :, 2] == start[keys.STATE][:, None, 2]).all()
     assert not (b[keys.COLLISION] | b[keys.OFFROAD])[:, :, 2].any()
-
-
-def test_nearest_elements_are_the_ones_seen() -> None:
-    env = make_env(crossing(9), config=ObservationConfig(num_objects=3, num_points=40))
-    td, scenes = env.start(torch.tensor([0])), env.scenes
-    here = td[keys.STATE][0, 0, :2]
-    for key, where, count, skip in (
-        (keys.OBJECTS, scenes.log_state[0, 0, :, :2], 3, 1),
-        (keys.POINTS, scenes.point[0], 40, 0),
-    ):
-        seen = td[key][0, 0, :, :2].norm(dim=-1).sort().values * 20
-        true = (where - here).norm(dim=-1).sort().values[skip : skip + count]
-        torch.testing.assert_close(seen, true, atol=1e-3, rtol=1e-4)
-
-
-def test_padding_does_not_decide_between_equally_near_points() -> None:
-    one, tied = scene(crossing(6), [0, 1]), 0
-    distance = (one.point[0] - one.log_state[0, 0, 0, :2]).square().sum(-1)[one.point_valid[0]].sort().values
-    for count in range(8, 200, 5):
-        tied += bool(distance[count - 1] == distance[count])
-        config = ObservationConfig(num_objects=3, num_points=count)
-        seen = []
-        for extra in (0, 57, 1300):
-            wide = one.clone()
-            for name in (
-                "point",
-                "point_direction",
-                "point_speed",
-                "point_type",
-                "point_light",
-                "point_valid",
-            ):
-                value = getattr(one, name)
-                filler = value.new_zeros(1, extra, *value.shape[2:])
-                setattr(wide, name, torch.cat([value, filler], 1))
-            env = DrivingEnv(wide, Bicycle(), config)
-            seen.append(env.start(torch.tensor([0]))[keys.POINTS][0, 0])
-        for other in seen[1:]:
-            assert sorted(other.tolist()) == sorted(seen[0].tolist())
-    assert tied > 3
-
-
-def test_what_is_not_valid_is_not_seen() -> None:
-    segment = crossing(6)
-    gone = hide(segment, 3, slice(0, 10))
-    env, less = make_env(segment, config=ALL), make_env(gone, config=ALL)
-    count = [e.start(torch.tensor([0]))[keys.OBJECTS_MASK][0, 0].sum().item() for e in (env, less)]
-    assert count == [5, 4]
-
-
-def test_lights_show_their_state_at_each_step() -> None:
-    segment = crossing()
-    env = make_env(segment, config=ALL)
-    out = run(env, env.start(torch.tensor([0])), torch.full((1, 50, 2), 73))
-    states = out[keys.POINTS][0, :, 0, :, -9:].sum(-2)
-    for t in (0, 20, 24, 30, 49):
-        expected = torch.bincount(
-            torch.from_numpy(segment.signal_state[:, t + 1].astype("int64")), minlength=9
-        )
-        assert states[t].tolist() == expected.tolist()
 
 
 def test_playback_follows_the_log_and_interactive_agents_do_not() -> None:
@@ -299,15 +189,6 @@ def test_collision_and_offroad_flags() -> None:
     assert run(env, start, leave)[keys.OFFROAD].flatten().tolist() == [False, False, True]
     assert run(env, start, stay)[keys.REWARD].flatten().tolist() == [0, 0, 0]
     assert run(env, start, leave)[keys.REWARD].flatten().tolist() == [0, 0, -1]
-
-
-def test_gradient_flows_through_a_rollout_into_what_is_seen() -> None:
-    env = make_env(dynamics=Displacement())
-    plan = actions(env, (2, 8)).requires_grad_()
-    out = run(env, env.start(torch.tensor([0, 1])), plan)
-    (out[keys.OBJECTS].sum() + out[keys.POINTS].sum()).backward()
-    assert torch.isfinite(plan.grad).all()
-    assert (plan.grad[:, 0].abs() > 0).any()
 
 
 def test_step_gradient_matches_finite_differences() -> None:
@@ -339,15 +220,214 @@ def test_constant_velocity_keeps_its_speed_and_course() -> None:
         torch.testing.assert_close(now[keys.STATE][0, :, :2], truth, atol=0.01, rtol=0)
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+NOTHING = ObservationConfig.nothing()
+EVERYTHING = ObservationConfig(num_objects=4, num_points=60, clearance=True, foresight=(0.5, 1.0))
+KEYS = {"own", "objects", "objects_mask", "points", "points_mask", "gap", "gap_ahead", "road"}
+
+
+@pytest.mark.parametrize(
+    ("config", "missing"),
+    [
+        (EVERYTHING, set()),
+        (ObservationConfig(num_objects=0, num_points=0), KEYS - {"own"}),
+        (ObservationConfig(num_objects=0, num_points=7), KEYS - {"own", "points", "points_mask"}),
+        (ObservationConfig(3, 0), KEYS - {"own", "objects", "objects_mask"}),
+        (ObservationConfig(0, 0, clearance=True, foresight=(1.0,)), KEYS - {"own", "road"}),
+        (NOTHING, KEYS),
+    ],
+)
+@pytest.mark.parametrize("shape", [(), (2, 3)])
+def test_there_are_entries_for_what_is_asked_for(
+    config: ObservationConfig, missing: set[str], shape: tuple[int, ...]
+) -> None:
+    env = make_env(config=config)
+    start = env.reset(TensorDict(batch_size=shape))
+    check_env_specs(env, tensordict=start)
+    agents = start["agents"]
+    seen = set(agents["observation"].keys()) if "observation" in agents.keys() else set()  # noqa: SIM118
+    assert seen == KEYS - missing
+    assert ("observation" in agents.keys()) == bool(seen)  # noqa: SIM118
+
+
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
-def test_a_moved_environment_gives_the_same_numbers(dynamics: Any) -> None:
-    here = make_env(dynamics=dynamics, config=ALL)
-    there = make_env(dynamics=dynamics, config=ALL).to("cuda")
-    plan = actions(here, (2, 20))
-    a = run(here, here.start(torch.tensor([0, 1])), plan)
-    b = run(there, there.start(torch.tensor([0, 1], device="cuda")), plan.cuda()).cpu()
-    for key in (keys.STATE, keys.OWN, keys.COLLISION, keys.OFFROAD):
-        torch.testing.assert_close(a[key], b[key], atol=1e-3, rtol=0)
-    assert there.reset().device.type == "cuda"
+def test_what_is_observed_changes_no_state_and_no_flag(dynamics: Any) -> None:
+    envs = [
+        make_env(dynamics=dynamics, config=config)
+        for config in (EVERYTHING, NOTHING, ObservationConfig(0, 3))
+    ]
+    now = [env.start(torch.tensor([0, 1, 1]), torch.arange(3)) for env in envs]
+    rng, flags = torch.Generator().manual_seed(0), torch.zeros(())
+    for _ in range(25):
+        action = (
+            torch.randint(147, (3, 2), generator=rng)
+            if dynamics.discrete
+            else torch.rand(3, 2, 2, generator=rng) * torch.tensor([3.0, 0.3])
+        )
+        now = [env.step(td.set(keys.ACTION, action))["next"] for env, td in zip(envs, now, strict=True)]
+        for other in now[1:]:
+            for key in (keys.STATE, keys.COLLISION, keys.OFFROAD, keys.REWARD, "done"):
+                assert torch.equal(now[0][key], other[key])
+        flags = flags + now[0][keys.REWARD].sum()
+    assert flags < 0
+
+
+def test_states_can_be_observed_without_an_environment() -> None:
+    logs = [crossing(4, seed=1, steps=9), straight_road(4, steps=9)]
+    scenes = collate([scene(log, [0, 1], LaneGraph(log.road)) for log in logs])
+    config = replace(EVERYTHING, num_objects=3, num_points=12, route=True)
+    env = DrivingEnv(scenes, None, config)
+    now = env.start(torch.tensor([0, 1, 1]), goal=torch.tensor([[0, -1], [0, 0], [1, 0]]))
+    for _ in range(3):
+        now = env.step(now.set(keys.ACTION, torch.full((3, 2), 90)))["next"]
+    row, step = now[keys.SCENE].squeeze(-1), now[keys.STEP].squeeze(-1)
+    state, valid, goal, come = (now[key] for key in (keys.STATE, keys.VALID, keys.GOAL, keys.PROGRESS))
+    seen, _ = observe_states(scenes, row, step, state, valid, config, goal=goal, progress=come)
+    assert now[keys.ROUTE].any()
+    for name, value in now["agents", "observation"].items():
+        assert torch.equal(seen[name], value), name
+
+
+def test_tables_follow_the_scenes() -> None:
+    one, two = make_env(config=EVERYTHING), make_env(config=EVERYTHING)
+    two.scenes = collate([scene(crossing(5), [0, 1]), scene(straight_road(3), [0, 1])])
+    fresh = DrivingEnv(two.scenes, None, EVERYTHING)
+    one.start(torch.tensor([0, 1]))
+    one.scenes = two.scenes
+    for env in (one, two):
+        assert (env.start(torch.tensor([0, 1])) == fresh.start(torch.tensor([0, 1]))).all()
+
+
+@pytest.mark.filterwarnings("ignore:The method <bound method TensorDictBase.__deepcopy__")
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])  # noqa: S301 - our own
+def test_copies_simulate_the_same(copied: Any) -> None:
+    env = make_env(config=EVERYTHING)
+    start = env.start(torch.tensor([0, 1])).set(keys.ACTION, torch.full((2, 2), 80))
+    after = env.step(start.clone())["next"]
+    twin = copied(env)
+    assert (twin.step(start.clone())["next"] == after).all()
+    kept = [made._kept() for made in (env, twin)]
+    assert kept[0] is not kept[1]
+    assert kept[1].scenes is twin.scenes
+
+
+def test_agents_see_their_size_their_speed_and_that_the_log_ends() -> None:
+    short, long = straight_road(steps=4), crossing(steps=6)
+    scenes = collate([scene(short, [0, 1]), scene(long, [0, 1])])
+    env = DrivingEnv(scenes, Bicycle(), ObservationConfig(num_objects=0, num_points=0))
+    state, told = env.start(torch.arange(2)), []
+    for _ in range(6):
+        own = state["agents", "observation", "own"]
+        told.append(own[:, 0, 3].tolist())
+        scales = env.observation.speed_scale, env.observation.size_scale
+        torch.testing.assert_close(own[..., 0] * scales[0], state[keys.STATE][..., 3])
+        torch.testing.assert_close(own[..., 1:3] * scales[1], scenes.box_size[:, :2])
+        state.set(keys.ACTION, torch.full((2, 2), env.dynamics.num_actions // 2))
+        state = env.step(state)["next"]
+    # With three and five steps to take; what goes on after its end is told so, too.
+    assert told == [[k >= 3, k >= 5] for k in range(6)]
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+def test_a_place_that_is_not_finite_spoils_what_is_seen_from_there_alone(wrong: float) -> None:
+    """And NumPy does not warn of it."""
+    env = make_env(config=ObservationConfig(num_objects=0, num_points=5))
+    state = env.start(torch.tensor([0, 1]))
+    good = env.at(state)[keys.POINTS]
+    state[keys.STATE][1, 0, 0] = wrong
+    found = env.at(state)[keys.POINTS]
+    assert not found[1, 0].isfinite().all()
+    assert torch.equal(found[0], good[0])
+    assert torch.equal(found[1, 1], good[1, 1])
+
+
+BAD = (math.nan, math.inf, -math.inf)
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("who", [0, 3])
+def test_others_still_collide(bad: float, who: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    state = torch.zeros(1, 4, 5)
+    state[0, :, 0] = torch.tensor([0.0, 50, 51, 100])
+    state[0, who, 0] = bad
+    objects = Objects(
+        state,
+        torch.ones(1, 4, dtype=torch.bool),
+        torch.tensor([4.0, 2.0]).expand(1, 4, 2),
+    )
+    index = torch.arange(4)[None]
+    found = collision_flags(objects, index)
+    assert found.tolist() == [[False, True, True, False]]
+    monkeypatch.setattr(module, "on_host", lambda tensor: False)
+    assert torch.equal(collision_flags(objects, index), found)
+
+
+def test_masked_objects_are_zero_and_pass_no_gradient() -> None:
+    scenes = scene(straight_road(3, steps=11), [0, 1, 2])
+    env = DrivingEnv(scenes, Displacement(), ObservationConfig(num_objects=4, num_points=10, gaps=True))
+    action = torch.zeros(1, 3, 2)
+    action[..., 0] = 1.0
+    action[0, 0, 0] = math.nan
+    action.requires_grad_()
+    after = env.step(env.start(torch.tensor([0])).set(keys.ACTION, action))["next"]
+    seen = after["agents", "observation"]
+    hidden = ~seen["objects_mask"][0, 1:]
+    assert hidden.any()
+    assert (seen["objects"][0, 1:][hidden] == 0).all()
+    assert (seen["gap"][0, 1:][hidden] == 0).all()
+    (gradient,) = torch.autograd.grad(seen["objects"][0, 1:].sum(), action)
+    assert gradient[0, 1:].isfinite().all()
+    assert gradient[0, 1:].any()
+
+
+def test_lights_keep_their_last_state_after_the_log_however_long_others_are() -> None:
+    config = ObservationConfig(num_objects=2, num_points=300)
+    short, long = scene(crossing(3, steps=5, seed=1), [0]), scene(crossing(3, steps=15, seed=2), [0])
+    found = []
+    for scenes in (short, collate([short, long])):
+        env = DrivingEnv(scenes, observation=config)
+        now = env.start(torch.tensor([0]))
+        for _ in range(7):
+            now = env.step(now.set(keys.ACTION, torch.full((1, 1), 73)))["next"]
+        points, mask = (now["agents", "observation", name] for name in ("points", "points_mask"))
+        found.append(points[mask])
+    assert torch.equal(*found)
+
+
+def test_a_route_that_is_not_there_is_none() -> None:
+    segment = crossing(3, steps=9, seed=1)
+    scenes = scene(segment, [0, 1], LaneGraph(segment.road))
+    env = DrivingEnv(scenes, observation=ObservationConfig(num_objects=2, num_points=2, route=True))
+    start, many = env.start(torch.tensor([0])), scenes.route_count.shape[2]
+    for goal in (-1, many, many + 1):
+        seen = env.with_goals(start, torch.tensor([[goal, 0]]))["agents", "observation", "route"]
+        assert not seen[0, 0].any()
+        assert seen[0, 1].any()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 6])
+@pytest.mark.parametrize("name", ["num_acceleration", "num_steering"])
+def test_a_grid_without_a_middle_is_refused(name: str, count: int) -> None:
+    with pytest.raises(ConfigError, match=name):
+        Bicycle(**{name: count})
+
+
+def test_a_grid_has_an_action_that_does_nothing() -> None:
+    for count in (3, 7, 21):
+        grid = Bicycle(num_acceleration=count)
+        acceleration, steering = (part.numpy() for part in grid.grid(torch.zeros(1)))
+        assert np.flatnonzero((acceleration == 0) & (steering == 0)).tolist() == [grid.num_actions // 2]
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_an_action_that_is_not_finite_ends_the_episode_of_its_scene(bad: float) -> None:
+    scenes = collate(
+        [scene(straight_road(3, steps=11), [0, 1]), scene(straight_road(3, steps=11, seed=1), [0, 1])]
+    )
+    env = DrivingEnv(scenes, Displacement(), ObservationConfig.nothing())
+    action = torch.zeros(2, 2, 2)
+    action[..., 0] = 1.0
+    action[1, 1, 0] = bad
+    after = env.step(env.start(torch.tensor([0, 1])).set(keys.ACTION, action))["next"]
+    assert after["terminated"].tolist() == after["done"].tolist() == [[False], [True]]
+    assert after["truncated"].tolist() == [[False], [False]]
+    assert after[keys.REWARD].squeeze(-1).tolist() == [[0, 0], [0, -1]]

@@ -1,4 +1,4 @@
-"""Routes as the networks see them, goals as state, and clearances."""
+"""Routes as the networks see them, goals as state, clearances, and open traffic."""
 
 from __future__ import annotations
 
@@ -12,25 +12,23 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tensordict import TensorDict
-from torchrl.envs.utils import check_env_specs
 
 from helpers_segments import CAR, crossing, straight_road
 from symphony import keys
 from symphony.data.segment import Polylines, RunSegment
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
+from symphony.envs.edge import leaving
+from symphony.envs.objects import Objects, entering
 from symphony.envs.routes import (
     AHEAD,
     CHOICE_FEATURES,
     POINTS,
     ROUTE_FEATURES,
     SPACING,
-    STRIDE,
     TURN_FEATURES,
     FollowedRoutes,
     Routes,
     RouteWindow,
-    drivable,
     route_ahead,
     route_choices,
     route_table,
@@ -39,8 +37,7 @@ from symphony.errors import DataWarning
 from symphony.geometry.boxes import box_gap
 from symphony.geometry.polylines import stations_along
 from symphony.roadgraph import LaneGraph
-from symphony.roadgraph.assign import LATERAL
-from test_env import actions, moved, run
+from test_env import actions, run
 
 SCALE = 20.0
 EVERYTHING = ObservationConfig(num_objects=16, num_points=30, route=True, clearance=True)
@@ -89,33 +86,6 @@ def choices_of(state: torch.Tensor, *lines: NDArray[np.float64], turns: bool = F
 
 lines = st.builds(bend, st.integers(2, 20), st.floats(-2.5, 2.5), st.floats(10, 60))
 headings = st.floats(-6, 6)
-
-
-@given(lines, st.floats(0, 0.99), st.floats(-9, 9), st.floats(0, 0.9), headings)
-def test_the_lateral_offset_is_the_signed_distance_to_the_route(
-    line: NDArray[np.float64], where: float, offset: float, share: float, heading: float
-) -> None:
-    k = int(where * (len(line) - 1))
-    along = (line[k + 1] - line[k]) / SPACING
-    left = np.array([-along[1], along[0]])
-    place = line[k] + share * SPACING * along + offset * left
-    # The route is cut at the point nearest to the vehicle; where the foot lies on the piece before, the offset is
-    # that from the piece's continuation.
-    assume(np.argmin(np.hypot(*(line - place).T)) == k)
-    route, point = shapely.LineString(line), shapely.Point(place)
-    foot = shapely.line_locate_point(route, point) / SPACING
-    assume(k - 1e-6 <= foot <= k + 1 + 1e-6)
-    assume(abs(route.distance(point) - abs(offset)) < 1e-6)
-    seen = see(*place, heading, line)
-    # Positive where the route lies to the left, that is, where the vehicle is to the right of it.
-    np.testing.assert_allclose(seen[1] * 5, -np.sign(offset) * route.distance(point), atol=1e-6)
-    turned = complex(*along) * np.exp(-1j * heading)
-    np.testing.assert_allclose(seen[2:4], [turned.real, turned.imag], atol=1e-9)
-
-
-@given(st.floats(10.1, 1000), st.sampled_from([-1, 1]))
-def test_far_from_the_route_the_offset_is_cut(offset: float, side: int) -> None:
-    assert see(10.0, side * offset, 0.3, bend(turn=0.0))[1] == -2 * side
 
 
 @given(lines, st.floats(0, 0.999), st.floats(-3, 3), headings)
@@ -211,21 +181,6 @@ def test_what_else_is_in_the_table_changes_nothing(count: int, seed: int) -> Non
         assert (features[length[1:] == 0] == 0).all()
 
 
-def test_choices_are_points_of_the_route_with_their_directions() -> None:
-    line, heading, place = bend(straight=6, turn=1.2), 0.7, complex(3.0, -2.0)
-    state = torch.tensor([[[place.real, place.imag, heading, 5.0]]], dtype=torch.float64)
-    features = choices_of(state, line)
-    rows = features[0, 0, 0].reshape(-1, 5).numpy()
-    kept = np.arange(0, len(line), STRIDE)
-    assert (rows[len(kept) :] == 0).all()
-    back = (rows[: len(kept), 0] + 1j * rows[: len(kept), 1]) * SCALE * np.exp(1j * heading) + place
-    np.testing.assert_allclose(np.stack([back.real, back.imag], -1), line[kept], atol=1e-9)
-    course = (rows[: len(kept), 2] + 1j * rows[: len(kept), 3]) * np.exp(1j * heading)
-    steps = np.diff(np.concatenate([line, line[-1:]]), axis=0)[kept]
-    np.testing.assert_allclose(np.stack([course.real, course.imag], -1), steps / SPACING, atol=1e-9)
-    assert (rows[: len(kept), 4] == 1).all()
-
-
 @given(lines, st.integers(2, POINTS - 2), st.floats(-3.5, 3.5), headings)
 def test_turns_say_where_a_route_bends(
     line: NDArray[np.float64], where: int, aside: float, heading: float
@@ -245,13 +200,6 @@ def test_turns_say_where_a_route_bends(
     assert set(other) <= {where - 2, where - 1}
     if abs(aside) > 1.0:
         assert len(other) > 0
-
-
-def test_where_a_route_begins_is_told_to_the_decimetre() -> None:
-    line, state = bend(), torch.tensor([[[0.0, 0.0, 0.0, 5.0]]], dtype=torch.float64)
-    features = choices_of(state, *(line + np.array([0.0, y]) for y in (0.0, 0.1, 3.2)), turns=True)
-    _, left = features[0, 0, :, CHOICE_FEATURES : CHOICE_FEATURES + 2].unbind(-1)
-    torch.testing.assert_close(3.0 * left.atanh(), torch.tensor([0.0, 0.1, 3.2], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -275,21 +223,6 @@ def test_the_logged_route_is_where_the_vehicle_drove(seed: int) -> None:
     assert min(turns) > 0.5
 
 
-def test_routes_are_evenly_spaced_from_beside_the_vehicle() -> None:
-    segment = crossing(4, seed=1)
-    graph = LaneGraph(segment.road)
-    for agent in range(4):
-        table = route_table(segment, graph, agent)
-        start = segment.position[agent, 0, :2]
-        for route in range(len(table.count)):
-            line = table.line(route)
-            assert np.hypot(*(line[0] - start)) < LATERAL
-            step = np.hypot(*np.diff(line, axis=0).T)
-            assert (step < SPACING + 1e-3).all()
-            assert (step[:-1] > 0.9 * SPACING).all()
-        assert np.hypot(*(table.line(table.logged)[0] - start)) < 0.1
-
-
 def test_a_vehicle_on_no_lane_has_no_route() -> None:
     segment = straight_road(2)
     position = segment.position.copy()
@@ -304,15 +237,6 @@ def test_a_vehicle_on_no_lane_has_no_route() -> None:
     assert (start[keys.ROUTE][0, 1] == 0).all()
     assert start[keys.ROUTE][0, 0, 0] == 1
     assert not env.choices(start)[keys.ROUTES_MASK][0, 1].any()
-
-
-@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
-@pytest.mark.parametrize("shape", [(), (2, 3)])
-def test_torchrl_accepts_an_environment_with_routes(dynamics: Any, shape: tuple[int, ...]) -> None:
-    config = replace(EVERYTHING, foresight=(1.0,))
-    env = make_env(straight_road(), crossing(), dynamics=dynamics, config=config)
-    start = env.reset(TensorDict(batch_size=shape))
-    check_env_specs(env, tensordict=start, break_when_any_done="both")
 
 
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
@@ -350,18 +274,6 @@ def test_a_rollout_with_goals_is_the_same_in_any_batch(dynamics: Any) -> None:
     assert torch.equal(one[keys.GAP][0].sort(-1).values, wide[keys.GAP].sort(-1).values)
 
 
-def test_moving_the_world_changes_no_route_and_no_clearance() -> None:
-    segment = crossing(6, seed=1)
-    here, there = make_env(segment), make_env(moved(segment, 2.1, 310.0, -95.0))
-    plan = actions(here, (1, 15))
-    a, b = (run(e, e.with_goals(e.start(torch.tensor([0]))), plan) for e in (here, there))
-    for key in (keys.ROUTE, keys.ROAD):
-        torch.testing.assert_close(a[key], b[key], atol=2e-3, rtol=0)
-    torch.testing.assert_close(a[keys.GAP].sort(-1).values, b[keys.GAP].sort(-1).values, atol=2e-3, rtol=0)
-    one, two = (e.choices(e.start(torch.tensor([0])))[keys.ROUTES] for e in (here, there))
-    torch.testing.assert_close(one, two, atol=2e-3, rtol=0)
-
-
 def test_the_gradient_of_what_is_seen_matches_finite_differences() -> None:
     line = bend(straight=4, turn=1.0, radius=20)
     point = torch.from_numpy(line)
@@ -370,35 +282,6 @@ def test_the_gradient_of_what_is_seen_matches_finite_differences() -> None:
     start = torch.tensor([state], dtype=torch.float64, requires_grad=True)
     seen = routes.window(torch.tensor([[1.0, 13.0, 20.0]], dtype=torch.float64))
     assert torch.autograd.gradcheck(lambda s: route_ahead(s, seen, SCALE), (start,))
-
-
-def test_gradient_flows_through_a_rollout_into_route_and_clearance() -> None:
-    env = make_env(crossing(6), straight_road(5), dynamics=Displacement())
-    for key in (keys.ROUTE, keys.GAP, keys.ROAD):
-        plan = actions(env, (2, 8)).requires_grad_()
-        out = run(env, env.with_goals(env.start(torch.tensor([0, 1]))), plan)
-        out[key].sum().backward()
-        assert torch.isfinite(plan.grad).all(), key
-        assert (plan.grad[:, 0].abs() > 0).any(), key
-
-
-def test_gaps_are_those_between_the_boxes_that_are_seen() -> None:
-    env = make_env(crossing(7), straight_road(5), dynamics=Displacement())
-    out = run(env, env.start(torch.arange(2)[:, None].expand(2, 6)), actions(env, (2, 6, 15)))
-    objects, mask, gap = out[keys.OBJECTS], out[keys.OBJECTS_MASK], out[keys.GAP]
-    assert not mask.all()
-    assert (gap[~mask] == 0).all()
-    zero, size = torch.zeros(()), torch.tensor(CAR[:2])
-    heading = torch.atan2(objects[..., 3], objects[..., 2])
-    expected = box_gap(zero.expand(2), zero, size, objects[..., :2] * SCALE, heading, objects[..., 8:10] * 5)
-    torch.testing.assert_close(gap[mask], expected[mask], atol=1e-3, rtol=0)
-    own = torch.cat([out[keys.OWN][..., :1], torch.zeros_like(out[keys.OWN][..., :1])], -1)[..., None, :]
-    relative = objects[..., 4:6] - own
-    torch.testing.assert_close(objects[..., 6:8][mask], relative[mask], atol=1e-4, rtol=0)
-    # All objects are seen, so an overlap is a collision and the other way round.
-    hit = ((gap < 0) & mask).any(-1)
-    assert torch.equal(hit, out[keys.COLLISION].squeeze(-1))
-    assert 0 < hit.float().mean() < 1
 
 
 def test_gaps_ahead_are_those_after_everyone_kept_speed_and_course() -> None:
@@ -445,21 +328,6 @@ def test_road_distances_are_those_of_centre_and_corners(x: float, y: float, head
     # The environment simplifies the boundary by up to 0.02 m.
     np.testing.assert_allclose(seen[keys.ROAD][0, 0], signed, atol=0.03)
     assert seen[keys.OFFROAD][0, 0, 0] == (seen[keys.ROAD][0, 0, 0] > 0)
-
-
-@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
-def test_clearance_changes_no_flag(dynamics: Any) -> None:
-    segments = crossing(5), straight_road(4)
-    plain = make_env(*segments, dynamics=dynamics, config=ObservationConfig(num_objects=2, num_points=1))
-    clear = make_env(
-        *segments, dynamics=dynamics, config=ObservationConfig(num_objects=2, num_points=1, clearance=True)
-    )
-    plan = actions(plain, (2, 8, 20))
-    a, b = (run(e, e.start(torch.arange(2)[:, None].expand(2, 8)), plan) for e in (plain, clear))
-    for key in (keys.STATE, keys.COLLISION, keys.OFFROAD, keys.REWARD):
-        assert torch.equal(a[key], b[key])
-    assert 0 < a[keys.OFFROAD].float().mean() < 1
-    assert a.get(keys.GAP, None) is None
 
 
 def test_tied_routes_are_drawn_evenly_and_by_segment_and_agent_alone():
@@ -513,30 +381,6 @@ def test_a_route_that_passes_itself_is_followed_in_order(speed: float, aside: fl
     assert torch.equal(seen.points[0, 0, 0], torch.from_numpy(line[first]))
 
 
-def test_progress_is_part_of_the_state() -> None:
-    segment = straight_road(3, steps=61)
-    env = make_env(segment)
-    start = env.with_goals(env.start(torch.tensor([0])))
-    assert (start[keys.PROGRESS].abs() < 1e-3).all()
-    out = run(env, start, actions(env, (1, 20)))
-    # The road leads along x.
-    driven = out[keys.STATE][0, ..., 0] - start[keys.STATE][0, :, 0]
-    torch.testing.assert_close(out[keys.PROGRESS][0], driven, atol=0.05, rtol=0)
-    # Without a route there is no progress.
-    free = run(env, env.start(torch.tensor([0])), actions(env, (1, 20)))
-    assert (free[keys.PROGRESS] == 0).all()
-
-
-def test_routes_reach_what_can_be_driven_and_two_hundred_metres_more() -> None:
-    slow, fast = straight_road(2, steps=51), straight_road(2, steps=151)
-    for segment in (slow, fast):
-        table = route_table(segment, LaneGraph(segment.road), 0)
-        lane = max(LaneGraph(segment.road).length)
-        reach = SPACING * (table.count[table.logged] - 1)
-        start = segment.position[0, 0, 0] - segment.road.lanes[0][0, 0]
-        assert reach >= min(drivable(segment) + 200.0, lane - start) - SPACING
-
-
 def test_an_agent_whose_routes_cannot_be_built_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
     segment = crossing(4)
 
@@ -574,3 +418,64 @@ def test_who_drives_under_a_bridge_has_no_route_over_it() -> None:
         table = route_table(segment.replace(position=position, road=road), LaneGraph(road), 0)
         assert len(table.count) == 1
         np.testing.assert_allclose(table.line(0)[:, 1], lane[0, 1] + aside, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("ahead", "aside", "speed", "its_speed", "enters"),
+    [
+        (5.6, 0.0, 0.0, 0.0, True),
+        (5.4, 0.0, 0.0, 0.0, False),  # 0.9 m between them
+        (9.0, 0.0, 10.0, 0.0, False),  # it would be there in half a second
+        (9.0, 0.0, 10.0, 10.0, True),
+        (-9.0, 0.0, 0.0, 9.0, False),  # who comes from behind
+        (-9.0, 4.0, 0.0, 9.0, True),
+        (13.0, 0.0, 9.0, 0.0, False),  # in a second
+        (15.0, 0.0, 9.0, 0.0, True),
+    ],
+)
+@pytest.mark.parametrize("angle", [0.0, 2.0])
+def test_who_enters_would_meet_nobody_within_a_second(
+    ahead: float, aside: float, speed: float, its_speed: float, enters: bool, angle: float
+) -> None:
+    forward, left = (
+        torch.tensor([np.cos(angle), np.sin(angle)]),
+        torch.tensor([-np.sin(angle), np.cos(angle)]),
+    )
+    rows = [
+        torch.cat([place, torch.tensor([angle]), v * forward])
+        for place, v in ((0 * forward, speed), (ahead * forward + aside * left, its_speed))
+    ]
+    objects = Objects(
+        torch.stack(rows)[None].float(),
+        torch.ones(1, 2, dtype=torch.bool),
+        torch.tensor([[[4.5, 2.0], [4.5, 2.0]]]),
+    )
+    for index, slot in (([[0]], 0), ([[1, 0]], 1)):
+        ready = torch.zeros(1, len(index[0]), dtype=torch.bool)
+        ready[0, slot] = True
+        assert entering(objects, torch.tensor(index), ready)[0, slot].item() == enters
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_on_a_device_the_same_enter(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There all are compared with all, as to look for those that are ready would wait for it."""
+    rng = torch.Generator().manual_seed(seed)
+    rows, agents, driven = 6, 9, 5
+    state = torch.rand(rows, agents, 5, generator=rng) * torch.tensor([40.0, 12, 6, 12, 4])
+    size = torch.tensor([4.5, 2.0]).expand(rows, agents, 2)
+    valid = torch.rand(rows, agents, generator=rng) < 0.9
+    objects = Objects(state, valid, size)
+    index = torch.rand(rows, agents, generator=rng).argsort(-1)[:, :driven]
+    ready = (torch.rand(rows, driven, generator=rng) < 0.6) & valid.gather(1, index)
+    found = entering(objects, index, ready)
+    assert 0 < found.sum() < ready.sum()
+    monkeypatch.setattr("symphony.geometry.nearest.on_host", lambda _: False)
+    assert torch.equal(entering(objects, index, ready), found)
+    assert not entering(objects, index, torch.zeros_like(ready)).any()
+
+
+def test_who_is_beyond_any_side_of_the_map_has_left() -> None:
+    hull = torch.tensor([[[1.0, 0, 10], [-1, 0, 10], [0, 1, 10], [0, -1, 10], [0, 0, 0]]])
+    after = torch.tensor([[[9.0, -9], [11, 0], [-11, 9], [0, 10.5], [3, -12]]])
+    none = torch.zeros(1, 2, 4)
+    assert leaving(torch.zeros_like(after), after, none, hull).tolist() == [[False, True, True, True, True]]

@@ -1,22 +1,32 @@
-"""A step, goals and flags on a device that isn't the CPU: no mixed devices, and nothing waits for it."""
+"""Steps, searches and losses on a device that isn't the CPU: nothing mixes devices or waits for it, and all tensors
+are what signatures say."""
 
 from __future__ import annotations
 
+import runpy
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from tensordict.nn import TensorDictSequential
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorDeviceMismatchError
 
-from helpers_device import NAME, on, pretend
+from helpers_device import NAME, PretendDevice, on, pretend
+from helpers_losses import CASES, LOGGED, ROWS, SCENES, batch_of, losses, searched, spec
+from helpers_processes import forget, output_of
 from helpers_segments import crossing, straight_road
-from symphony import keys
+from symphony import keys, objectives
+from symphony.agents import build_agent
+from symphony.collectors import Systematic
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.edge import map_edge
-from symphony.envs.flags import collision_flags, offroad_flags
-from symphony.envs.objects import everyone_at
-from symphony.envs.observation import observe
+from symphony.modules import SeededNoise
 from symphony.roadgraph import LaneGraph
+from symphony.rollouts.background import CarFollower
+from symphony.rollouts.unroll import simulate, start_states
 
 EVERYTHING = ObservationConfig(
     num_objects=3,
@@ -31,20 +41,17 @@ EVERYTHING = ObservationConfig(
 MANY, NOTHING = ObservationConfig(16, 4000), ObservationConfig.nothing()
 
 
-SCENES = collate([scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(), crossing(6))])
+ROADS = collate([scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(), crossing(6))])
 
 
 @pytest.mark.parametrize(
     ("config", "dynamics", "gradient"),
-    [
-        *((config, Bicycle(), False) for config in (EVERYTHING, MANY, NOTHING)),
-        *((config, Displacement(), True) for config in (EVERYTHING, MANY, NOTHING)),
-    ],
+    [(EVERYTHING, Displacement(), True), (MANY, Bicycle(), False), (NOTHING, Bicycle(), False)],
 )
 def test_steps_goals_and_observations_stay_on_the_device(
     config: ObservationConfig, dynamics: Any, gradient: bool
 ) -> None:
-    env = DrivingEnv(SCENES, dynamics, config)
+    env = DrivingEnv(ROADS, dynamics, config)
     with pretend() as device, torch.set_grad_enabled(gradient):
         on(device, env)
         number = torch.arange(2, device=device.device)[:, None].expand(2, 3)
@@ -84,17 +91,6 @@ def act(env: DrivingEnv, state: Any, gradient: bool) -> Any:
     return state.copy().set(keys.ACTION, action)
 
 
-def test_observing_without_an_environment_stays_on_the_device() -> None:
-    with pretend() as device:
-        given = on(device, SCENES)
-        row = torch.zeros(5, dtype=torch.int64, device=device.device)
-        agent = row[:, None].expand(5, 2)
-        objects = everyone_at(given, row, row, torch.zeros(5, 2, 4, device=row.device), agent > 0)
-        seen = observe(given, row, row, objects, agent, EVERYTHING)
-        flags = collision_flags(objects, agent), offroad_flags(given, row, objects.state[:, :2, :2])
-        assert {value.device.type for value in (*seen.values(), *flags)} == {NAME}
-
-
 def test_the_pretended_device_notices() -> None:
     with pretend() as device:
         there = torch.zeros(3, device=device.device)
@@ -106,3 +102,90 @@ def test_the_pretended_device_notices() -> None:
         there.cpu()
         torch.tensor([1.0, 2.0]).to(device.device)
         assert len(device.waits) == 2
+
+
+FEW = 7  # constants that are made once, in however many steps
+
+
+@contextmanager
+def world(space: Any = "bicycle") -> Iterator[tuple[PretendDevice, Any, DrivingEnv]]:
+    """A device, and an agent and an environment on it."""
+    agent = build_agent("agent", spec(space))
+    env = DrivingEnv(SCENES, agent.dynamics, agent.observation)
+    with pretend() as device:
+        for module in agent.modules.values():
+            on(device, module)
+        yield device, agent, on(device, env)
+
+
+@pytest.mark.parametrize("space", ["bicycle", "displacement"])
+def test_simulations_stay_on_the_device(space: Any) -> None:
+    with world(space) as (device, agent, env):
+        policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
+        found = simulate(env, policy, start_states(env, agent.goals, trees=2, branches=1, seed=0))
+        assert found.state.shape == (2, 2, 1, LOGGED, 2, 4)
+        assert {part.device.type for part in found} == {NAME}
+        assert device.waits == []
+        assert device.constants < FEW
+
+
+def test_others_that_a_rule_drives_stay_on_the_device() -> None:
+    scenes = SCENES.clone()
+    scenes.background = scenes.interactive_valid.clone()
+    env = DrivingEnv(scenes, observation=ObservationConfig.nothing())
+    follow = CarFollower(env)  # looks at the maps once
+    with pretend() as device:
+        on(device, env)
+        follow.routes = type(follow.routes)(*(on(device, part) for part in follow.routes))
+        number = torch.arange(2, device=device.device)
+        state = env.start(number, number)
+        assert follow(state)[keys.BACKGROUND].device.type == NAME
+        assert device.waits == []
+        assert device.constants < FEW
+
+
+def test_searches_stay_on_the_device() -> None:
+    with world() as (device, agent, env):
+        start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
+        found = searched(agent, env, Systematic(0.6), start)
+        assert found.trajectories.shape == (2, 1, 3, LOGGED - 1)
+        assert found.totals.device.type == NAME
+        assert device.waits == []
+        assert device.constants < FEW
+
+
+@pytest.mark.parametrize("space", sorted({space for _, space in CASES}))
+def test_losses_and_their_gradients_stay_on_the_device(space: str) -> None:
+    with world(space) as (device, agent, env):
+        row = torch.arange(ROWS, device=device.device) % 2
+        batch, known = batch_of(env, env.start(row, row)), losses(agent, env)
+        for name in (name for name, used in CASES if used == space):
+            device.waits.clear()
+            out = known[name](batch.exclude(keys.ACTION) if name == "mgail" else batch.copy())
+            total = sum(value for key, value in out.items() if key.startswith("loss"))
+            assert isinstance(total, torch.Tensor), name
+            assert total.device.type == NAME, name
+            total.backward()
+            assert device.waits == [], name
+        assert device.constants < FEW
+
+
+def test_every_loss_is_among_them() -> None:
+
+    with world() as (_, agent, env):
+        known = {type(loss) for loss in losses(agent, env).values()}
+    there = [getattr(objectives, name) for name in objectives.__all__ if name.endswith("Loss")]
+    assert known == set(there)
+
+
+def instrumented() -> None:
+    """Take every loss once, as :mod:`helpers_losses` does as a program."""
+    forget("symphony", *(path.stem for path in Path(__file__).parent.glob("helpers_*.py")))
+    runpy.run_module("helpers_losses", run_name="__main__")
+
+
+def test_what_is_taken_and_returned_is_what_signatures_say(tmp_path: Path) -> None:
+    """All that runs for a step and a loss, with shapes and kinds of numbers checked."""
+    # In a process of its own, as the package must be instrumented when it is imported.
+    lines = output_of(instrumented, said=tmp_path / "said").splitlines()
+    assert [tuple(line.split()) for line in lines] == CASES

@@ -25,8 +25,7 @@ from symphony.envs import DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.flags import road_distance
 from symphony.envs.objects import rollout_heights
 from symphony.envs.points import nearest_points
-from symphony.envs.scene import PointType
-from symphony.envs.tables import Tables
+from symphony.envs.scene import PointType, Tables
 from symphony.evaluation import evaluate
 from symphony.geometry import LEVEL, levels_apart
 from symphony.saved.rollouts import world_of

@@ -1,4 +1,4 @@
-"""Displacements a vehicle can drive: the distribution, and the policy that draws from it."""
+"""Draws: counter-based numbers, and displacements that a vehicle can drive."""
 
 from __future__ import annotations
 
@@ -10,20 +10,92 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 from tensordict import TensorDict
-from tensordict.nn import InteractionType, set_interaction_type
-from torch.distributions import Normal
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from helpers_segments import crossing
-from symphony.envs import Displacement, DrivingEnv, ObservationConfig, collate, scene
+from symphony.config import AgentConfig, AgentSpec
+from symphony.envs import Displacement
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES
-from symphony.geometry.frames import rotate, wrap
+from symphony.errors import ConfigError
+from symphony.geometry.frames import wrap
 from symphony.keys import ACTION, NOISE, OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, STATE, VALID
-from symphony.modules import BoundedDisplacement, ElementGroup, SeededNoise, displacement_policy
-from symphony.modules.bounded import INSIDE, SMOOTH
+from symphony.modules import (
+    BoundedDisplacement,
+    DisplacementHistogram,
+    ElementGroup,
+    displacement_policy,
+    inverse_cdf,
+)
+from symphony.modules.bounded import INSIDE, LEAST, SMOOTH, displaced, shares
 from symphony.modules.displacement import _Parameters
 from symphony.objectives import BCLoss
-from test_env import moved
+from symphony.streams import Stream, fold_in, stream_of, uniform
+
+MASK = 2**64 - 1
+int64 = st.integers(-(2**63), 2**63 - 1)
+STREAM = -8660814866712981800
+"""Of the name ``a segment``, in every process."""
+
+
+def splitmix(state: int) -> int:
+    """The finaliser of SplitMix64 on Python's unbounded integers."""
+    state = ((state ^ (state >> 30)) * 0xBF58476D1CE4E5B9) & MASK
+    state = ((state ^ (state >> 27)) * 0x94D049BB133111EB) & MASK
+    return state ^ (state >> 31)
+
+
+def folded(stream: int, index: int) -> int:
+    return splitmix((stream + (index + 1) * 0x9E3779B97F4A7C15) & MASK)
+
+
+def test_the_hash_is_splitmix64():
+    # First output of the reference generator for state 0.
+    assert folded(0, 0) == 0xE220A8397B1DCDAF
+    assert int(fold_in(torch.tensor(0), 0)) & MASK == 0xE220A8397B1DCDAF
+
+
+@given(seed=int64, stream=int64, step=st.integers(0, 2**40))
+def test_tensor_arithmetic_equals_unbounded_integers(seed, stream, step):
+    bits = folded(folded(splitmix(seed & MASK), stream), step)
+    tensor = torch.tensor([stream])
+    assert uniform(seed, tensor, step).item() == (2 * (bits >> 41) + 1) * 2.0**-24
+
+
+def test_streams_keep_the_numbers_that_rollouts_were_made_with():
+    first = 1 << 40
+    assert {stream.name: stream - first for stream in Stream} == {
+        "GOALS": 0,
+        "PRUNING": 1,
+        "PLANNERS": 3,
+        "PERSONAS": 4,
+        "WALKS": 5,
+        "BACKTRACKING": first,
+    }
+
+
+def test_a_name_has_the_same_stream_in_every_process():
+    """A number from another one; Python's own hash of a text is another in each."""
+    assert stream_of("a segment") == STREAM != stream_of("a segment ")
+    assert -(2**63) <= STREAM < 2**63
+
+
+def test_a_draw_inverts_the_cumulative_distribution():
+    logits = torch.randn(50, 9, dtype=torch.float64)
+    upper = logits.softmax(-1).cumsum(-1)
+    lower = upper - logits.softmax(-1)
+    for share in (0.01, 0.5, 0.99):
+        noise = lower + share * (upper - lower)
+        drawn = inverse_cdf(logits[:, None].expand(50, 9, 9), noise)
+        assert torch.equal(drawn, torch.arange(9).expand(50, 9))
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0**-24, 0.5, 1 - 2.0**-24, 1.0])
+def test_impossible_categories_are_never_drawn(noise):
+    torch.manual_seed(0)
+    logits = torch.randn(2000, 12)
+    allowed = torch.rand(2000, 12) < 0.4
+    allowed[:, 5] = True
+    drawn = inverse_cdf(logits.masked_fill(~allowed, -torch.inf), torch.full((2000,), noise))
+    assert allowed.gather(1, drawn[:, None]).all()
+
 
 GROUPS = (
     ElementGroup(OBJECTS, OBJECTS_MASK, OBJECT_FEATURES),
@@ -76,16 +148,6 @@ def test_latent_numbers_come_back(pace, slope, first, second):
     torch.testing.assert_close(dist.latent(dist.displacement(u)), u, rtol=1e-6, atol=1e-6)
 
 
-@given_bounds
-def test_displacements_within_the_bounds_come_back(pace, slope, first, second):
-    dist = make(pace, slope)
-    low, high = (dist.displacement(double([u, 0.0])[0])[0] for u in (-INNER, INNER))
-    forward = low + (high - low) * (0.5 + 0.5 * first / INNER)
-    wanted = torch.stack([forward, forward * slope * INSIDE * second / INNER])
-    got = dist.displacement(dist.latent(wanted))
-    torch.testing.assert_close(got, wanted, rtol=1e-6, atol=1e-8)
-
-
 @settings(max_examples=40)
 @given(st.floats(0, 8), st.floats(0.005, 0.3), st.floats(-30, 30), st.floats(-30, 30))
 def test_whatever_was_logged_has_a_likelihood(pace, slope, forward, left):
@@ -95,14 +157,6 @@ def test_whatever_was_logged_has_a_likelihood(pace, slope, forward, left):
     assert dist.log_prob(value).isfinite()
     nearest = dist.displacement(dist.latent(value))
     torch.testing.assert_close(dist.log_prob(value), dist.log_prob(nearest), rtol=1e-4, atol=1e-4)
-
-
-@given_bounds
-def test_the_density_is_that_of_the_gaussian_over_the_volume(pace, slope, first, second):
-    dist, u = make(pace, slope, (0.3, -0.4), (0.7, 1.5)), double([first, second])[0]
-    volume = torch.autograd.functional.jacobian(dist.displacement, u).det().abs()
-    expected = Normal(dist.loc, dist.scale).log_prob(u).sum() - volume.log()
-    torch.testing.assert_close(dist.log_prob(dist.displacement(u)), expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("pace", [0.0, 0.1, 3.0])
@@ -156,19 +210,6 @@ def test_draws_are_those_of_the_gaussian(how):
     assert abs(stats.spearmanr(drawn[:, 0].numpy(), across.numpy()).statistic) < 0.03
 
 
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-def test_shapes(batch):
-    dist = make().expand(batch)
-    assert (dist.batch_shape, dist.event_shape) == (torch.Size(batch), torch.Size([2]))
-    assert isinstance(dist, BoundedDisplacement)
-    drawn = dist.sample((5,))
-    assert drawn.shape == (5, *batch, 2)
-    assert dist.log_prob(drawn).shape == (5, *batch)
-    assert dist.mode.shape == dist.deterministic_sample.shape == (*batch, 2)
-    torch.testing.assert_close(dist.log_prob(drawn), make().log_prob(drawn))
-    assert torch.equal(dist.mode, make().mode.expand(*batch, 2))
-
-
 numbers = st.floats(-1e6, 1e6, width=32)
 
 
@@ -199,76 +240,6 @@ def test_every_draw_can_be_driven(speed, length, first, second):
     assert ((curvature - rounding) * speed**2 <= LATERAL * (1 + 1e-3)).all()
 
 
-@settings(max_examples=40)
-@given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
-def test_a_standing_car_neither_slides_nor_spins(first, second):
-    u, state = torch.tensor([first, second], requires_grad=True), torch.tensor([3.0, 4.0, 0.5, 0.0])
-    dist = make(0.0, SLOPE, dtype=torch.float32)
-    after = Displacement().step(state, dist.displacement(u), torch.tensor([4.6, 1.9]), DT)
-    # What the largest acceleration reaches from standstill, and the turn of a wheel held at the largest angle.
-    assert (after[:2] - state[:2]).norm() <= 1.1 * (REACH + SMOOTH)
-    assert (after[2] - state[2]).abs() <= SLOPE * (REACH + SMOOTH) / (0.3 * 4.6) + 1e-6
-    (gradient,) = torch.autograd.grad(after.sum(), u)
-    assert gradient.isfinite().all()
-    assert gradient.abs().max() < 10
-
-
-@pytest.mark.parametrize("steering", [-5.0, 5.0])
-def test_a_braking_car_comes_to_rest(steering):
-    u, state = torch.tensor([-5.0, steering], requires_grad=True), torch.tensor([0.0, 0.0, 0.0, 6.0])
-    path = [state]
-    for _ in range(50):
-        pace = path[-1][3] * DT
-        dist = BoundedDisplacement(u, torch.ones(2), pace, torch.tensor(SLOPE), REACH)
-        path.append(Displacement().step(path[-1], dist.mode, torch.tensor([4.6, 1.9]), DT))
-    track = torch.stack(path)
-    assert (track[1:, 3] >= 0).all()
-    assert track[10:, 3].max() < 0.1
-    # At rest, with the wheel still held over, for 8 s.
-    assert (track[-1, :3] - track[10, :3]).abs().max() < 0.1
-    (gradient,) = torch.autograd.grad(track[-1].sum(), u)
-    assert gradient.isfinite().all()
-
-
-def test_exploration_type_decides_how_actions_are_drawn():
-    actor, td = policy(), observed(200)
-    modes = actor.get_dist(td.clone()).mode
-    for kind in (InteractionType.DETERMINISTIC, InteractionType.MODE):
-        with set_interaction_type(kind):
-            assert torch.equal(actor(td.clone())[ACTION], modes)
-            assert torch.equal(actor(td.clone().set(NOISE, torch.rand(200, 3, 2)))[ACTION], modes)
-    noise = torch.rand(200, 3, 2)
-    for kind in (ExplorationType.RANDOM, None):
-        with set_exploration_type(kind):
-            drawn = actor(td.clone().set(NOISE, noise))[ACTION]
-            assert torch.equal(drawn, actor.get_dist(td.clone()).icdf(noise))
-            torch.manual_seed(5)
-            first, second = (actor(td.clone())[ACTION] for _ in range(2))
-            assert not torch.equal(first, second)
-            torch.manual_seed(5)
-            assert torch.equal(actor(td.clone())[ACTION], first)
-
-
-@pytest.mark.parametrize("angle", [0.7, -2.5])
-def test_turning_the_world_changes_nothing(angle):
-    segment, turn, shift = crossing(seed=2, steps=12), torch.tensor(angle), torch.tensor([30.0, -12.0])
-    actor, tracks, actions = policy(), [], []
-    sees = ObservationConfig(num_objects=5, num_points=40)
-    for world in (segment, moved(segment, angle, 30.0, -12.0)):
-        env = DrivingEnv(collate([scene(world, [0, 1, 2])]), Displacement(), sees)
-        now, draw = env.start(torch.tensor([0])), SeededNoise(3, env.dynamics.numbers)
-        with torch.no_grad():
-            for _ in range(8):
-                now = env.step(actor(draw(now)))["next"]
-        tracks.append(now[STATE])
-        actions.append(actor(draw(now))[ACTION])
-    torch.testing.assert_close(actions[0], actions[1], rtol=1e-3, atol=1e-3)
-    torch.testing.assert_close(
-        rotate(tracks[0][..., :2], turn) + shift, tracks[1][..., :2], rtol=0, atol=5e-3
-    )
-    assert wrap(tracks[0][..., 2] + turn - tracks[1][..., 2]).abs().max() < 2e-3
-
-
 def test_padded_agents_change_nothing():
     actor, td = policy(), observed(8)
     td[ACTION] = actor(td.clone())[ACTION].detach()
@@ -282,49 +253,6 @@ def test_padded_agents_change_nothing():
         results.append([out, *torch.autograd.grad(out, list(actor.parameters()))])
     for a, b in zip(*results, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
-
-
-def test_regression_to_the_log_reaches_every_parameter():
-    actor, td = policy(), observed(40)
-    # The bounds depend on the state alone, so that these numbers are what the network has to learn.
-    wanted = td[OWN][..., [0, 2]] - 1
-    td[ACTION] = actor.get_dist(td.clone()).displacement(wanted).detach()
-    loss = BCLoss(actor)
-    first = loss(td)["loss_bc"]
-    first.backward()
-    assert all(p.grad is not None and p.grad.norm() > 0 for p in actor.parameters())
-    optimizer = torch.optim.Adam(actor.parameters(), lr=0.02)
-    for _ in range(40):
-        optimizer.zero_grad()
-        last = loss(td)["loss_bc"]
-        last.backward()
-        optimizer.step()
-    assert last < first - 1
-    before, after = (
-        (a.get_dist(td.clone()).loc - wanted)[td[VALID]].square().mean() for a in (policy(), actor)
-    )
-    assert after < 0.3 * before
-
-
-def test_weights_follow_the_seed_and_can_be_kept():
-    td = observed(4).set(NOISE, torch.rand(4, 3, 2))
-    actor, other = policy(), policy(seed=1)
-    assert all(torch.equal(a, b) for a, b in zip(actor.parameters(), policy().parameters(), strict=True))
-    assert not torch.equal(actor(td.clone())[ACTION], other(td.clone())[ACTION])
-    other.load_state_dict(actor.state_dict())
-    assert torch.equal(actor(td.clone())[ACTION], other(td.clone())[ACTION])
-
-
-@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
-def test_shapes_and_keys_are_free(batch):
-    names = {OWN: "own", VALID: "ok", STATE: "where", NOISE: "u"}
-    renamed = {"own_keys": ("own",), "valid_key": "ok", "state_key": "where", "noise_key": "u"}
-    td = observed(*batch).set(NOISE, torch.rand(*batch, 3, 2))
-    expected = policy()(td.clone())[ACTION]
-    assert (expected.shape, expected.dtype) == ((*batch, 3, 2), torch.float32)
-    for old, new in names.items():
-        td.rename_key_(old, new)
-    assert torch.equal(policy(**renamed, action_key="a")(td)["a"], expected)
 
 
 @pytest.mark.parametrize("name", ["dt", "max_acceleration", "max_lateral", "max_slope", "min_scale"])
@@ -347,3 +275,115 @@ def test_what_is_offered_turns_no_sharper_than_tyres_hold(speed: float, length: 
     expected = min(slope, lateral * arm / max(speed, 1e-6) ** 2)
     assert expected / math.sqrt(2) - 1e-6 <= most <= expected + 1e-6
     assert most == pytest.approx(slope, rel=1e-3) or speed > 0.5
+
+
+F, L = 5, 7
+
+
+def histogram(*batch, seed=0, logits=None, pace=2.0, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+    drawn = 3 * torch.rand((*batch, F * L), generator=generator, dtype=dtype)
+    logits = drawn if logits is None else torch.as_tensor(logits, dtype=dtype).expand(*batch, F * L)
+    bounds = (torch.full(batch, value, dtype=dtype) for value in (pace, 0.2))
+    return DisplacementHistogram(logits, *bounds, REACH, F)
+
+
+@pytest.mark.parametrize("pace", [0.05, 2.0])
+def test_the_density_integrates_to_one_and_is_that_of_the_draws(pace):
+    dist = histogram(pace=pace)
+    low, high = (displaced(torch.tensor([g, 0.0]).double(), dist.pace, dist.slope, REACH)[0] for g in (-1, 1))
+    # What is slower counts as standing.
+    low = low.clamp_min(LEAST)
+    forward = low + (high - low) * (torch.arange(4000).double() + 0.5) / 4000
+    cell = (forward[1] - forward[0]) * forward[:, None] * dist.slope * 0.005
+    side = ((torch.arange(400).double() + 0.5) / 200 - 1)[None]
+    value = torch.stack(torch.broadcast_tensors(forward[:, None], forward[:, None] * dist.slope * side), -1)
+    mass = dist.log_prob(value).exp() * cell
+    torch.manual_seed(0)
+    drawn = dist.sample((100_000,))
+    stands = (drawn[:, 0] < LEAST).double().mean()
+    assert mass.sum() + stands == pytest.approx(1.0, abs=5e-3)
+    expected = (mass[..., None] * value).sum((0, 1))
+    torch.testing.assert_close(drawn[drawn[:, 0] >= LEAST].sum(0) / len(drawn), expected, rtol=0, atol=5e-3)
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(st.floats(-80, 80), min_size=F * L, max_size=F * L),
+    st.floats(2**-24, 1 - 2**-24),
+    st.floats(2**-24, 1 - 2**-24),
+    st.floats(0, 8),
+)
+def test_any_numbers_give_a_displacement(logits, first, second, pace):
+    for dtype in (torch.float32, torch.float64):
+        dist = histogram(logits=logits, pace=pace, dtype=dtype)
+        drawn = dist.icdf(torch.tensor([first, second], dtype=dtype))
+        assert drawn.isfinite().all()
+        assert dist.log_prob(drawn).isfinite()
+        assert 0 <= drawn[0] <= pace + REACH + 0.02
+        assert drawn[1].abs() <= 0.2001 * drawn[0]
+
+
+def test_gradients_by_differences_of_histogram():
+    dist, noise = histogram(4), torch.rand(4, 2, generator=torch.Generator().manual_seed(1)).double()
+    logits, pace, slope = (value.requires_grad_() for value in (dist.logits, dist.pace, dist.slope))
+    inside = dist.icdf(noise).detach()
+
+    def likelihood(*parts):
+        return DisplacementHistogram(*parts, REACH, F).log_prob(inside)
+
+    assert torch.autograd.gradcheck(likelihood, (logits, pace, slope))
+    assert torch.autograd.gradcheck(
+        lambda x: DisplacementHistogram(x, pace, slope, REACH, F).mean_share, logits
+    )
+
+
+def test_a_draw_moves_with_the_mean_and_is_the_same_with_a_gradient():
+    dist, noise = histogram(6), torch.rand(6, 2).double()
+    without = dist.icdf(noise)
+    dist.logits.requires_grad_()
+    drawn = dist.icdf(noise)
+    assert torch.equal(drawn, without)
+    mean, share = dist.mean_share, shares(without, dist.pace, dist.slope, REACH).requires_grad_()
+    (expected,) = torch.autograd.grad(displaced(share, dist.pace, dist.slope, REACH).sum(), share)
+    (by_mean,) = torch.autograd.grad((mean * expected).sum(), dist.logits, retain_graph=True)
+    (found,) = torch.autograd.grad(drawn.sum(), dist.logits)
+    torch.testing.assert_close(found, by_mean)
+    assert found.norm() > 0
+
+
+def test_a_policy_tells_two_manners_apart():
+    """Where half of the experts brake and half accelerate, one Gaussian learns to do neither."""
+    torch.manual_seed(0)
+    td, brakes = observed(120), torch.rand(120, 3) < 0.5
+    wanted = torch.stack([torch.where(brakes, -1.0, 1.0), torch.zeros(120, 3)], -1)
+    bounds, between, left = policy().get_dist(td.clone()), [], []
+    td[ACTION] = bounds.displacement(wanted + 0.1 * torch.randn(120, 3, 2)).detach()
+    for cells in (0, 11):
+        actor = policy(cells=cells)
+        loss, optimizer = BCLoss(actor), torch.optim.Adam(actor.parameters(), lr=0.02)
+        for _ in range(75):
+            optimizer.zero_grad()
+            loss(td)["loss_bc"].backward()
+            optimizer.step()
+        assert all(p.grad is not None and p.grad.norm() > 0 for p in actor.parameters())
+        actions = actor(td.clone().set(NOISE, torch.rand(120, 3, 2)))[ACTION]
+        # One that stands does not show whether it brakes.
+        fast = td[VALID] & (td[STATE][..., 3] > 2)
+        drawn = bounds.latent(actions)[fast][:, 0]
+        between.append((drawn.abs() < 0.5).double().mean())
+        left.append((drawn < -0.5).double().mean())
+    assert between[0] > 0.25
+    assert between[1] < 0.1
+    assert 0.35 < left[1] < 0.65
+
+
+@pytest.mark.parametrize("cells", [-1, 1, 4])
+def test_a_number_of_cells_without_a_middle_and_sides_is_refused(cells):
+    with pytest.raises(ValueError, match="cells must be odd"):
+        policy(cells=cells)
+
+
+def test_cells_are_of_displacements():
+    with pytest.raises(ConfigError, match="cells are of displacements"):
+        AgentSpec(action_space="bicycle", dt=DT, agent=AgentConfig(cells=5))

@@ -1,4 +1,4 @@
-"""Lane graph and lane assignment on hand-made maps."""
+"""Lane graph, lane assignment and branching regions on hand-made maps."""
 
 from __future__ import annotations
 
@@ -10,27 +10,9 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers_roadgraph import arc, crossing, fork, make_road, merge, moved_road, roundabout, straight, turned
+from helpers_roadgraph import arc, crossing, drive, fork, make_road, roundabout, straight
 from symphony.errors import DataError
-from symphony.roadgraph import LaneGraph, lane_of, starting_lanes
-
-
-def middle(graph, lane):
-    line = shapely.LineString(graph.lines[lane])
-    a, b = (np.array(line.interpolate(f, normalized=True).coords[0]) for f in (0.5, 0.51))
-    return a, np.arctan2(*(b - a)[::-1])
-
-
-def test_crossing_connects_as_drawn():
-    road, name = crossing()
-    graph = LaneGraph(road)
-    assert graph.successors[name["in0"]] == tuple(sorted(name[k] for k in ("left0", "ahead0", "right0")))
-    assert graph.successors[name["out0"]] == ()
-    assert graph.predecessors[name["out0"]] == tuple(sorted(name[k] for k in ("ahead2", "right3", "left1")))
-    for a, after in enumerate(graph.successors):
-        for b in after:
-            assert a in graph.predecessors[b]
-            np.testing.assert_allclose(graph.lines[a][-1], graph.lines[b][0], atol=1e-5)
+from symphony.roadgraph import LaneGraph, lane_of, starting_lanes, visited_regions
 
 
 def test_regions_of_a_crossing():
@@ -49,13 +31,6 @@ def test_regions_of_a_crossing():
     assert abs(regions.entry_heading[ahead]) == pytest.approx(np.pi)
 
 
-def test_merge_and_roundabout_regions():
-    assert len(LaneGraph(merge()[0]).regions) == 0
-    road, name = roundabout()
-    regions = LaneGraph(road).regions
-    assert sorted(regions.lane) == sorted(name[f"{k}{i}"] for k in ("stay", "exit") for i in range(4))
-
-
 @settings(max_examples=25, deadline=None)
 @given(
     st.floats(3, 100),
@@ -72,25 +47,6 @@ def test_curvature_of_an_arc_is_one_over_its_radius(radius, sweep, clockwise, be
     assert curvature == pytest.approx(
         (-1 if clockwise else 1) / radius * (pieces - 1) / pieces, rel=1e-2, abs=1e-4
     )
-
-
-def test_curvature_of_an_s_bend_averages_out():
-    bend = np.concatenate((arc((0, 0), 20, -90, 0), arc((40, 0), 20, 180, 90)[1:]))
-    (curvature,) = LaneGraph(make_road({"a": bend})[0]).curvature
-    assert abs(curvature) < 1e-3
-
-
-def test_bike_lanes_are_left_out():
-    road, name = fork()
-    road = dataclasses.replace(road, lane_type=np.array([2, 3, 2], np.uint8))
-    graph = LaneGraph(road)
-    assert graph.successors[name["stem"]] == (name["on"],)
-    assert len(graph.regions) == 0
-    position, heading = middle(graph, name["up"])
-    assert lane_of(graph, position, heading) == -1
-    everything = LaneGraph(road, exclude=())
-    assert len(everything.regions) == 2
-    assert lane_of(everything, position, heading) == name["up"]
 
 
 def test_bad_maps_name_the_field():
@@ -115,26 +71,6 @@ def test_repeated_points_and_connections_change_nothing():
     np.testing.assert_array_equal(a.length, b.length)
     assert a.successors == b.successors
     assert len(b.regions) == 2
-
-
-@pytest.mark.parametrize("make", [crossing, roundabout, fork, merge])
-def test_every_lane_claims_its_own_middle(make):
-    graph = LaneGraph(make()[0])
-    places = [middle(graph, k) for k in range(len(graph))]
-    position, heading = np.array([p for p, _ in places]), np.array([h for _, h in places])
-    np.testing.assert_array_equal(lane_of(graph, position, heading), np.arange(len(graph)))
-    np.testing.assert_array_equal(lane_of(graph, position, heading + 6 * np.pi), np.arange(len(graph)))
-
-
-def test_wrong_way_and_far_away_have_no_lane():
-    road, name = fork()
-    graph = LaneGraph(road)
-    assert lane_of(graph, [20, 2.9], 0.0) == name["stem"]
-    assert lane_of(graph, [20, 3.1], 0.0) == -1
-    assert lane_of(graph, [20, 0], np.pi) == -1
-    assert lane_of(graph, [20, 0], np.radians(59)) == name["stem"]
-    assert lane_of(graph, [20, 0], np.radians(61)) == -1
-    assert starting_lanes(graph, [20, 0], np.pi) == []
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
@@ -187,18 +123,6 @@ def test_assignment_agrees_with_shapely(seed):
         assert not fits or fits[found[i]] <= min(fits.values()) + 0.25 + 1e-9
 
 
-def test_assignment_is_invariant_under_rigid_motion():
-    road, _ = crossing()
-    rng = np.random.default_rng(0)
-    position, heading = rng.uniform(-30, 30, (300, 2)), rng.uniform(-4, 4, 300)
-    there = LaneGraph(moved_road(road, 37, [500, -200]))
-    moved = turned(position, 37) + np.array([500, -200])
-    here = lane_of(LaneGraph(road), position, heading)
-    assert (here >= 0).sum() > 50
-    assert (lane_of(there, moved, heading + np.radians(37)) == here).mean() > 0.99
-    np.testing.assert_allclose(there.curvature, LaneGraph(road).curvature, atol=1e-5)
-
-
 def test_starting_lanes_around_a_junction():
     road, name = crossing()
     graph = LaneGraph(road)
@@ -216,3 +140,146 @@ def test_starting_lanes_around_a_junction():
     # Cutting into a turn, a vehicle may be nearer to another connector than to its own by a metre.
     wide = starting_lanes(graph, [1.5, -4.5], np.radians(110))
     assert {k for k, _ in wide} >= {name["left0"], name["ahead0"]}
+
+
+MOVES = [(kind, k) for k in range(4) for kind in ("left", "ahead", "right")]
+EXIT = {"left": 3, "ahead": 2, "right": 1}
+
+
+def lanes_visited(graph, name, position, heading, valid=None):
+    valid = np.ones(len(position), bool) if valid is None else valid
+    found = visited_regions(graph, position, heading, valid)
+    back = {k: lane for lane, k in name.items()}
+    return sorted(back[k] for k in graph.regions.lane[found])
+
+
+def movement(graph, name, kind, k, **options):
+    lanes = (f"in{k}", f"{kind}{k}", f"out{(k + EXIT[kind]) % 4}")
+    return drive(*(graph.lines[name[lane]] for lane in lanes), **options)
+
+
+def test_invalid_states_are_bridged_and_never_read():
+    road, name = crossing()
+    graph = LaneGraph(road)
+    position, heading = movement(graph, name, "left", 0, step=0.5)
+    valid = np.ones(len(position), bool)
+    valid[114:124] = False
+    position[~valid], heading[~valid] = np.nan, np.nan
+    assert lanes_visited(graph, name, position, heading, valid) == ["left0"]
+    assert lanes_visited(graph, name, position, heading, np.zeros_like(valid)) == []
+
+
+def random_batch(graph, name, seed=0, shape=(3, 4), steps=60):
+    rng = np.random.default_rng(seed)
+    position, heading = np.zeros((*shape, steps, 2)), np.zeros((*shape, steps))
+    for i in np.ndindex(shape):
+        kind, k = MOVES[rng.integers(12)]
+        p, h = movement(graph, name, kind, k, step=rng.uniform(0.5, 2.5), offset=rng.normal(0, 0.3))
+        first = rng.integers(0, len(p) - 5)
+        take = np.clip(np.arange(first, first + steps), None, len(p) - 1)
+        position[i], heading[i] = p[take], h[take]
+    return position, heading, rng.random((*shape, steps)) < 0.9
+
+
+@pytest.mark.parametrize("part", [0, 1])
+def test_a_valid_state_that_is_not_finite_is_refused(part):
+    road, _ = crossing()
+    path = [np.zeros((5, 2)), np.zeros(5)]
+    path[part][3] = np.nan
+    with pytest.raises(ValueError, match="must be finite"):
+        visited_regions(LaneGraph(road), *path, np.ones(5, bool))
+
+
+def test_trajectories_that_share_a_history_or_stand_equal_each_alone(monkeypatch):
+    road, name = crossing()
+    graph = LaneGraph(road)
+    position, heading, valid = random_batch(graph, name, shape=(4,))
+    history = (p[[0, 0, 0, 1, 2, 3, 3]].copy() for p in (position, heading, valid))
+    position, heading, valid = history
+    position[1, 30:], heading[1, 30:] = position[3, 30:], heading[3, 30:]
+    heading[2, 30:] += np.pi  # in the same places, the other way
+    position[4, 20:], heading[4, 20:] = position[4, 20], heading[4, 20]
+    position[5] = position[6, ::-1]
+    looked, near = [], type(graph.region_index).near
+    monkeypatch.setattr(
+        type(graph.region_index),
+        "near",
+        lambda index, points, reach: looked.append(points) or near(index, points, reach),
+    )
+    together = visited_regions(graph, position, heading, valid)
+    assert together.any()
+    assert len(looked[0]) == len(np.unique(position[valid], axis=0)) < valid.sum()
+    for i in range(len(valid)):
+        np.testing.assert_array_equal(together[i], visited_regions(graph, position[i], heading[i], valid[i]))
+
+
+def brute_force(graph, position, heading, valid):
+    """The definition, word by word, for one trajectory."""
+    position, heading = position[valid], heading[valid]
+    regions = graph.regions
+    lines = [shapely.LineString(graph.lines[k]) for k in regions.lane]
+
+    def turn(a, b):
+        return abs((a - b + np.pi) % (2 * np.pi) - np.pi)
+
+    def on(r, t):
+        at = lines[r].project(shapely.Point(position[t]))
+        near = lines[r].distance(shapely.Point(position[t])) < 2
+        arcs = graph.arc[regions.lane[r]]
+        piece = min(np.searchsorted(arcs, at, side="right") - 1, len(arcs) - 2)
+        step = np.diff(graph.lines[regions.lane[r]], axis=0)[piece]
+        return near and turn(np.arctan2(step[1], step[0]), heading[t]) <= np.pi / 4
+
+    def comes_to(r, t):
+        if t == 0 and on(r, 0):
+            return True
+        if t == len(position) - 1:
+            return False
+        path, entry = shapely.LineString(position[t : t + 2]), shapely.Point(regions.entry[r])
+        late = path.project(entry) > path.length / 2
+        return path.distance(entry) <= 2 and turn(regions.entry_heading[r], heading[t + late]) <= np.pi / 4
+
+    def clearly(t, group):
+        distance = {r: lines[r].distance(shapely.Point(position[t])) for r in group}
+        near = min(group, key=distance.get)
+        rest = min(d for r, d in distance.items() if r != near)
+        return near if on(near, t) and rest >= distance[near] + 0.5 else None
+
+    result = np.zeros(len(regions), bool)
+    for parent in np.unique(regions.parent):
+        group = np.flatnonzero(regions.parent == parent)
+        coming, before, decision = False, False, None
+        for t in range(len(position)):
+            now = any(comes_to(r, t) for r in group)
+            if now and not before:
+                if decision is not None:
+                    result[decision] = True
+                coming, decision = True, None
+            before = now
+            if coming and (here := clearly(t, group)) is not None:
+                decision = here
+        if decision is not None:
+            result[decision] = True
+    return result
+
+
+@pytest.mark.parametrize("make", [crossing, roundabout])
+def test_agrees_with_the_definition(make):
+    road, _ = make()
+    graph = LaneGraph(road)
+    rng = np.random.default_rng(5)
+    hits = 0
+    for _ in range(20):
+        # A loose walk along the lanes, and now and then none.
+        lane, path = rng.integers(len(graph)), []
+        for _ in range(rng.integers(1, 9)):
+            path.append(graph.lines[lane])
+            after = graph.successors[lane]
+            lane = rng.choice(after) if after and rng.random() < 0.9 else rng.integers(len(graph))
+        position, heading = drive(*path, step=rng.uniform(0.5, 3), offset=rng.normal(0, 0.5))
+        position = position + rng.normal(0, rng.choice([0, 0.3, 1]), position.shape)
+        valid = rng.random(len(position)) < 0.9
+        expected = brute_force(graph, position, heading, valid)
+        np.testing.assert_array_equal(visited_regions(graph, position, heading, valid), expected)
+        hits += expected.sum()
+    assert hits > 20

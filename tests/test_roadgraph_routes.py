@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from helpers_roadgraph import (
     crossing,
     drive,
-    fork,
     merge,
     moved_road,
     parallel,
@@ -32,7 +31,6 @@ from symphony.roadgraph import (
     route_line,
     route_lines,
     routes,
-    starting_lanes,
 )
 from symphony.roadgraph import ground_truth_routes as ground_truth
 from symphony.roadgraph.paths import arc_lengths, at, beside, distinct, sharpest
@@ -77,24 +75,6 @@ def test_crossing_has_three_routes_from_each_arm():
         assert found == sorted(found)
 
 
-def test_horizon_counts_from_the_vehicle():
-    road, name = crossing()
-    graph = LaneGraph(road)
-    assert lanes_of(routes(graph, [(name["in0"], 10.0)], horizon=50)) == [(name["in0"],)]
-    assert len(routes(graph, [(name["in0"], 10.0)], horizon=51)) == 3
-    assert len(routes(graph, [(name["in0"], 20.0)], horizon=50)) == 3
-
-
-def test_fork_merge_and_end():
-    road, name = fork()
-    found = routes(LaneGraph(road), [(name["stem"], 0.0)])
-    assert lanes_of(found) == [named(name, "stem", "up"), named(name, "stem", "on")]
-    road, name = merge()
-    assert lanes_of(routes(LaneGraph(road), [(name["b"], 0.0)])) == [named(name, "b", "c")]
-    assert lanes_of(routes(LaneGraph(road), [(name["c"], 0.0)], horizon=1e6)) == [named(name, "c")]
-    assert routes(LaneGraph(road), []) == []
-
-
 def test_roundabout_ends_by_the_horizon():
     road, name = roundabout()
     graph = LaneGraph(road)
@@ -132,14 +112,6 @@ def test_routes_do_not_depend_on_the_order_of_connections():
     shuffled = np.random.default_rng(0).permutation(road.successors)
     other = LaneGraph(dataclasses.replace(road, successors=shuffled))
     assert routes(graph, [(name["r"], 0.0)], limit=20) == routes(other, [(name["r"], 0.0)], limit=20)
-
-
-def test_beyond_the_horizon_routes_go_on_straight():
-    road, name = crossing()
-    graph = LaneGraph(road)
-    found = routes(graph, [(name["in0"], 10.0)], horizon=50, onward=40)
-    assert lanes_of(found) == [named(name, "in0", "ahead0", "out2")]
-    assert len(routes(graph, [(name["in0"], 10.0)], horizon=51, onward=200)) == 3
 
 
 def test_pocket_is_reached_by_a_change_where_it_begins():
@@ -184,14 +156,6 @@ def test_a_neighbour_that_has_ended_or_leads_elsewhere_is_no_lane_to_change_to()
             assert found[1].begins == max(100.0, other[0][0])
 
 
-def test_routes_inside_a_junction_start_on_every_connector():
-    road, name = crossing()
-    graph = LaneGraph(road)
-    found = lanes_of(routes(graph, starting_lanes(graph, np.array([2.0, -8.0]), np.pi / 2)))
-    assert {route[0] for route in found} == {name["left0"], name["ahead0"], name["right0"]}
-    assert found[0][0] == name["ahead0"]
-
-
 @pytest.mark.parametrize("degrees", [0, 73])
 @pytest.mark.parametrize("movement", ["left0", "ahead0", "right0", "left2"])
 def test_ground_truth_is_the_route_that_was_driven(movement, degrees):
@@ -232,32 +196,6 @@ def test_route_errors_agree_with_shapely():
     np.testing.assert_allclose(route_errors(lines, log), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("spacing", [0.7, 2.0, 500.0])
-def test_a_line_without_a_change_is_that_of_its_lanes(spacing):
-    road, name = crossing()
-    graph = LaneGraph(road)
-    route = Route(named(name, "in0", "left0", "out3"))
-    line = resampled(route_line(graph, route), spacing)
-    exact = shapely.LineString(np.concatenate([graph.lines[k] for k in route.lanes]))
-    assert shapely.distance(exact, shapely.points(line)).max() < 1e-6
-    np.testing.assert_allclose(line[0], graph.lines[route.lanes[0]][0])
-    np.testing.assert_allclose(line[-1], graph.lines[route.lanes[-1]][-1])
-    gaps = np.hypot(*np.diff(line, axis=0).T)
-    assert (gaps <= spacing + 1e-6).all()
-    assert (gaps > 0).all()
-    assert len(line) == int(np.ceil((exact.length - 1e-6) / spacing)) + 1
-
-
-def test_a_line_begins_where_it_is_asked_to_and_ends_by_its_length():
-    road, name = crossing()
-    graph = LaneGraph(road)
-    route = Route(named(name, "in0", "ahead0", "out2"))
-    line = resampled(route_line(graph, route, start=10), 2.0, 31)
-    np.testing.assert_allclose(line[0], [2, -60])
-    np.testing.assert_allclose(line[-1], [2, -29])
-    assert len(line) == 17
-
-
 lengths = st.floats(10.0, 60.0)
 curves = st.floats(-1 / 25, 1 / 25)
 
@@ -284,27 +222,6 @@ def test_a_blend_leads_forward_onto_the_line_without_a_kink(curvature, aside, pl
     # 1.5 d / length is the steepest of it, and a line of radius r turns by 3 / (r - d) where it is that much inside.
     bound = 6.0 * abs(aside) / length**2 * 3.0 + 3.0 * abs(curvature) / (1 - 4.5 * abs(curvature)) + 0.08
     assert sharpest(way) < bound
-
-
-@given(curves, st.floats(2.5, 4.0), st.sampled_from([-1, 1]), lengths)
-def test_a_change_there_and_back_ends_on_the_first_lane(curvature, width, side, length):
-    own, other = curved(curvature), curved(curvature, aside=side * width)
-    there = blend(other, own[5], length)
-    back = blend(own, there[arc_lengths(there) > length + 1.0][0], length)
-    assert beside(own, back[-1])[1] < 1e-6
-    assert np.hypot(*(back[-1] - own[-1])) < 1e-6
-
-
-@given(curves, st.floats(-3.0, 3.0), st.floats(-6.0, 6.0), st.floats(0.0, 6.3), st.floats(-500.0, 500.0))
-def test_a_blend_turns_and_moves_with_the_world(curvature, aside, along, angle, shift):
-    line, point = curved(curvature), np.array([along, aside])
-
-    def there(points):
-        return turned(points, np.degrees(angle)) + np.array([shift, -shift])
-
-    np.testing.assert_allclose(
-        blend(there(line), there(point), 30.0), there(blend(line, point, 30.0)), atol=1e-6
-    )
 
 
 @pytest.mark.parametrize("gap", [(0.0, 0.0), (1.2, 0.3), (-1.2, 0.0), (-1.0, 0.6), (0.4, -0.9)])
@@ -376,25 +293,6 @@ def test_routes_can_be_driven(which, share, speed):
         assert all(np.hypot(*(other - line).T).max() >= 1.0 for other in same)
 
 
-def test_routes_of_lanes_that_coincide_are_one():
-    lane = np.array([[0.0, 0.0], [300.0, 0.0]])
-    graph = LaneGraph(make_road([lane, *(lane + np.array([0.0, aside]) for aside in (0.4, 3.0))]))
-    starts = [(0, 5.0), (1, 5.0), (2, 5.0)]
-    kept, _ = route_lines(graph, routes(graph, starts), dict(starts), spacing=3.0, length=100.0)
-    assert lanes_of(kept) == [(0,), (2,)]
-
-
-def test_a_change_takes_the_longer_the_faster():
-    road, name = parallel()
-    graph = LaneGraph(road)
-    (_, changed) = routes(graph, [(name["a0"], 5.0)])
-    for speed, length in ((0.0, 20.0), (10.0, 30.0), (20.0, 60.0)):
-        assert change_length(speed) == length
-        line = route_line(graph, changed, 5.0, speed)
-        on = line[line[:, 1] > 3.5 - 1e-6]
-        assert on[0, 0] == pytest.approx(5.0 + length, abs=1.0)
-
-
 def test_a_lane_that_ends_inside_the_map_says_so():
     def line(*points):
         return np.array(points, float)
@@ -445,31 +343,3 @@ def test_going_around_the_block_first_is_not_the_way_of_the_log():
     right = ground_truth_routes(graph, found, round_once, np.ones(len(round_once), bool))
     assert {found[k].lanes[:4] for k in np.flatnonzero(right)} == {(0, 2, 0, 1)}
     assert ground_truth_routes(graph, found, direct[:10], valid[:10]).all()
-
-
-@functools.cache
-def two_blocks():
-    """A graph with a street between two blocks; routes that come by it twice, of different lengths; longer ones."""
-    street = np.stack([np.linspace(0.0, 30.0, 16), np.zeros(16)], -1)
-    small = np.array([[30.0, 0], [35, 5], [30, 12], [0, 12], [-5, 5], [0, 0]])
-    large = np.array([[30.0, 0], [40, -10], [30, -30], [0, -30], [-20, -12], [0, 0]])
-    lanes = [street, small, large, street + np.array([30.0, 0.0])]
-    graph = LaneGraph(make_road(lanes, successors=[(0, 1), (1, 0), (0, 2), (2, 0), (0, 3)]))
-    found, longer = (routes(graph, [(0, 2.0)], horizon=metres) for metres in (250.0, 400.0))
-    return lines_of(graph, found, 2.0), [way for way in lines_of(graph, longer) if len(way) > 100]
-
-
-@given(st.integers(0, 2**32 - 1), st.booleans())
-@settings(max_examples=15)
-def test_the_error_of_a_route_does_not_depend_on_those_beside_it(seed, drives):
-    lines, ways = two_blocks()
-    rng = np.random.default_rng(seed)
-    if drives:
-        # Beyond the end of a route, and back to where it was.
-        path = ways[rng.integers(len(ways))]
-        path = np.concatenate([path, path[:: rng.choice([-1, 2])]]) + rng.normal(0.0, 1.0, 2)
-    else:
-        # Also where no lane leads.
-        path = rng.uniform([-25.0, -35.0], [65.0, 15.0], (rng.integers(2, 40), 2))
-    alone = [route_errors([line], path)[0] for line in lines]
-    np.testing.assert_allclose(route_errors(lines, path), alone, atol=1e-12)

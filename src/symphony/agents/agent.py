@@ -16,7 +16,7 @@ from symphony.agents.checkpoint import CheckpointError, load_checkpoint
 from symphony.agents.choice import PREFIX, choose, split_name
 from symphony.agents.networks import dynamics_of, observation_of
 from symphony.config import AgentSpec, EvaluateConfig, SearchConfig, read_json
-from symphony.envs.dynamics import Bicycle, Displacement
+from symphony.envs.dynamics import Bicycle, ConstantVelocity, Displacement, RandomActions
 from symphony.envs.observation import ObservationConfig
 from symphony.errors import ConfigError, DataWarning
 from symphony.imports import load_object
@@ -165,8 +165,6 @@ def load_agent(name: str, device: str = "cpu", *, trust_code: bool = False) -> A
         ConfigError: if there is no such agent, checkpoint or device, or the folder names code.
         CheckpointError: if its weights can't be read, or its networks are larger than they are.
     """
-    from symphony.envs.baselines import ConstantVelocity, RandomActions  # noqa: PLC0415 - a training needs none
-
     if name == PLAYBACK:
         return Agent(name, None)
     if name in ("constant_velocity", "idm"):

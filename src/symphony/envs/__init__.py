@@ -8,9 +8,8 @@ from symphony.envs.scene import SceneBatch, SceneSource, collate, scene
 from symphony.imports import lazily
 
 if TYPE_CHECKING:
-    from symphony.envs.baselines import ConstantVelocity
     from symphony.envs.driving import DrivingEnv
-    from symphony.envs.dynamics import Bicycle, Displacement
+    from symphony.envs.dynamics import Bicycle, ConstantVelocity, Displacement
     from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
     from symphony.envs.routes import CHOICE_FEATURES, ROUTE_FEATURES
 

@@ -19,8 +19,7 @@ from symphony.envs.flags import collision_flags, offroad_flags
 from symphony.envs.objects import Objects, entering, everyone_at, rows_of
 from symphony.envs.observation import ObservationConfig, observation_spec, observe_states
 from symphony.envs.routes import route_choices
-from symphony.envs.scene import SceneBatch, SceneSource
-from symphony.envs.tables import Tables
+from symphony.envs.scene import SceneBatch, SceneSource, Tables
 from symphony.errors import ConfigError
 from symphony.geometry.frames import with_speed
 from symphony.geometry.nearest import on_host
@@ -203,9 +202,8 @@ class DrivingEnv(EnvBase):
     def compile(self, *args: Any, **kwargs: Any) -> None:
         """Compile the step in place, as :meth:`torch.nn.Module.compile` compiles a forward pass.
 
-        For few agents a step is mostly calls of small operators, which is what this saves; of many it compares each
-        with every point of the map, and loses. Copies of the environment are not compiled. Arguments are those of
-        :func:`torch.compile`, whose default backend needs a C++ compiler.
+        This saves the calls of small operators, of which a step of few agents consists; with many it loses. Copies of
+        the environment are not compiled. The default backend of :func:`torch.compile` needs a C++ compiler.
         """
         step = torch.compile(type(self)._step.__get__(self), *args, **kwargs)
         self._step = step  # type: ignore[method-assign]
@@ -374,7 +372,15 @@ class DrivingEnv(EnvBase):
             progress=progress if follows else None,
             tables=self._kept(),
         )
-        collision, offroad = self._flags(row, objects, real, seen)
+        index = scenes.interactive.index_select(0, row)
+        with torch.no_grad():
+            collision = collision_flags(objects, index) & real
+            if "road" in seen:
+                offroad = (seen["road"][..., 0] > 0) & real
+            else:
+                place = rows_of(objects.state, index)[..., :2]
+                height = None if objects.height is None else rows_of(objects.height, index)
+                offroad = offroad_flags(scenes, row, place, self._kept(), height) & real
         truncated = at >= scenes.last_step[row]
         flags = {keys.COLLISION: collision, keys.OFFROAD: offroad}
         terminated = _nowhere(moved, real).any(-1)
@@ -403,19 +409,6 @@ class DrivingEnv(EnvBase):
         rows |= {"truncated": back(truncated), "terminated": back(terminated)}
         whole = {name: value[..., None] for name, value in rows.items()} | {"agents": nested(agents)}
         return TensorDict(whole, batch_size=shape, device=self.device)
-
-    @torch.no_grad()
-    def _flags(
-        self, row: Tensor, objects: Objects, valid: Tensor, seen: dict[str, Tensor]
-    ) -> tuple[Bool[Tensor, "M N"], Bool[Tensor, "M N"]]:
-        """Who collides, and who is off the road."""
-        index = self.scenes.interactive.index_select(0, row)
-        collision = collision_flags(objects, index) & valid
-        if "road" in seen:
-            return collision, (seen["road"][..., 0] > 0) & valid
-        position = rows_of(objects.state, index)[..., :2]
-        height = None if objects.height is None else rows_of(objects.height, index)
-        return collision, offroad_flags(self.scenes, row, position, self._kept(), height) & valid
 
     def _kept(self) -> Tables:
         """What is looked up at each step of the present scenes."""

@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from symphony.envs.objects import Objects, rows_of
-from symphony.envs.scene import SceneBatch
-from symphony.envs.tables import Tables
+from symphony.envs.scene import SceneBatch, Tables
 from symphony.geometry.boxes import boxes_overlap
 from symphony.geometry.frames import levels_apart
 from symphony.geometry.nearest import on_host, places

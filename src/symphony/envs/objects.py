@@ -14,8 +14,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from symphony.envs.routes import RouteWindow, along_route
-from symphony.envs.scene import SceneBatch
-from symphony.envs.tables import AGENT_FEATURES, Tables
+from symphony.envs.scene import AGENT_FEATURES, SceneBatch, Tables
 from symphony.geometry.boxes import box_gap, gap_between
 from symphony.geometry.frames import constant, levels_apart, wrap
 from symphony.geometry.nearest import nearest, places

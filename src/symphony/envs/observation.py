@@ -16,8 +16,7 @@ from symphony.envs.flags import road_distance
 from symphony.envs.objects import OBJECT_FEATURES, Objects, Observers, everyone_at, observed_objects
 from symphony.envs.points import observed_lights, observed_points
 from symphony.envs.routes import ALONG_FEATURES, ROUTE_FEATURES, RouteWindow, route_ahead
-from symphony.envs.scene import SceneBatch
-from symphony.envs.tables import POINT_FEATURES, Tables
+from symphony.envs.scene import POINT_FEATURES, SceneBatch, Tables
 from symphony.geometry.boxes import box_corners
 
 __all__ = ["OBJECT_FEATURES", "POINT_FEATURES"]

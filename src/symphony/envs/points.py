@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from symphony.envs.objects import Observers, frame
-from symphony.envs.tables import LIGHT_COLUMN, Tables
+from symphony.envs.scene import LIGHT_COLUMN, Tables
 from symphony.geometry.frames import levels_apart
 from symphony.geometry.nearest import nearest, on_host
 

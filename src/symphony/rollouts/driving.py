@@ -16,8 +16,7 @@ from symphony.agents import Agent
 from symphony.collectors import Backtrack, BeamSearchResult, KeepAll, PruningRule, max_then_sum
 from symphony.config import EvaluateConfig
 from symphony.config.evaluation import Search
-from symphony.envs.baselines import ConstantVelocity
-from symphony.envs.dynamics import Bicycle
+from symphony.envs.dynamics import Bicycle, ConstantVelocity
 from symphony.envs.flags import offroad_flags
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
