@@ -9,14 +9,15 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from symphony.data import segment as schema
 from symphony.data.segment import (
+    STATES,
     AgentType,
     LaneType,
     MarkType,
     Polylines,
     RoadMap,
     RunSegment,
-    SignalState,
     validate,
 )
 
@@ -61,17 +62,7 @@ def make_segment(
     segment_id: str = "made",
     **changes: Any,
 ) -> RunSegment:
-    """Cars that are valid throughout, the first being the ego; any other field by name.
-
-    Args:
-        road: the map.
-        position: [A, T, 2 or 3].
-        heading: [A, T].
-        velocity: [A, T, 2].
-        dt: seconds per step.
-        segment_id: its name.
-        changes: further fields of :class:`RunSegment`.
-    """
+    """Cars that are valid throughout, the first being the ego; any other field by name."""
     agents, steps = heading.shape
     xyz = np.zeros((agents, steps, 3), np.float32)
     xyz[..., : position.shape[-1]] = position
@@ -98,7 +89,7 @@ def make_segment(
 
 def hide(segment: RunSegment, agent: int, steps: slice) -> RunSegment:
     """The segment with one agent not seen during some steps."""
-    fields = {name: getattr(segment, name).copy() for name in ("valid", "position", "heading", "velocity")}
+    fields = {name: getattr(segment, name).copy() for name in STATES}
     for array in fields.values():
         array[agent, steps] = 0
     return segment.replace(**fields)
@@ -116,12 +107,7 @@ def along(path: NDArray[Any], distance: NDArray[Any]) -> tuple[NDArray[Any], NDA
 
 
 def straight_road(
-    num_agents: int = 3,
-    steps: int = 51,
-    dt: float = 0.2,
-    seed: int = 0,
-    num_lanes: int = 3,
-    **changes: Any,
+    num_agents: int = 3, steps: int = 51, dt: float = 0.2, seed: int = 0, num_lanes: int = 3, **changes: Any
 ) -> RunSegment:
     """Cars at constant speeds (8-15 m/s, one per lane) on a one-way road along +x; nobody touches anybody.
 
@@ -217,10 +203,10 @@ def crossing(
         path = np.concatenate([road.lanes[lane][:, :2] for lane in route])
         position[k], heading[k] = along(path, arm - speed * (1.5 + gap * k) + speed * time)
     half = steps // 2
-    state = np.full((12, steps), SignalState.STOP, np.uint8)
-    state[[*range(3), *range(6, 9)], : max(half - 5, 1)] = SignalState.GO
-    state[[*range(3), *range(6, 9)], max(half - 5, 1) : half] = SignalState.CAUTION
-    state[[*range(3, 6), *range(9, 12)], half:] = SignalState.GO
+    state = np.full((12, steps), schema.SignalState.STOP, np.uint8)
+    state[[*range(3), *range(6, 9)], : max(half - 5, 1)] = schema.SignalState.GO
+    state[[*range(3), *range(6, 9)], max(half - 5, 1) : half] = schema.SignalState.CAUTION
+    state[[*range(3, 6), *range(9, 12)], half:] = schema.SignalState.GO
     lights: dict[str, Any] = {
         "signal_lane": np.arange(8, 20, dtype=np.int32),
         "signal_point": np.stack([road.lanes[lane][0] for lane in range(8, 20)]),
@@ -261,9 +247,7 @@ def random_segment(
         lanes=lines(lanes, 2),
         lane_id=rng.permutation(lanes).astype(np.int64) + 2**40,
         lane_type=picks(len(LaneType), lanes).astype(np.uint8),
-        speed_limit=np.where(rng.random(lanes) < 0.5, np.float32("nan"), rng.uniform(5, 30, lanes)).astype(
-            "f4"
-        ),
+        speed_limit=np.where(rng.random(lanes) < 0.5, np.nan, rng.uniform(5, 30, lanes)).astype(np.float32),
         successors=picks(lanes, int(rng.integers(4)), 2),
         left_neighbors=picks(lanes, int(rng.integers(3)), 2),
         right_neighbors=picks(lanes, int(rng.integers(3)), 2),
@@ -287,7 +271,7 @@ def random_segment(
         valid=valid,
         signal_lane=picks(lanes, lights),
         signal_point=floats(lights, 3),
-        signal_state=picks(len(SignalState), lights, steps).astype(np.uint8),
+        signal_state=picks(len(schema.SignalState), lights, steps).astype(np.uint8),
         origin=rng.normal(0, 1e6, 3),
         current_step=int(rng.integers(steps)),
         interest=picks(agents, int(rng.integers(3))),
@@ -312,9 +296,7 @@ def segments(segment_ids: st.SearchStrategy[str] | None = None) -> st.SearchStra
 
 
 def ring(gap: float = 25.0, radius: float = 15.0, steps: int = 51, aside: float = 0.2) -> RunSegment:
-    """A circle of two lanes that lead into one another, so that routes go around it twice; a car drives towards one
-    that stands so many metres ahead of its centre, `aside` metres beside the middle of the lane.
-    """
+    """A circle of two lanes that lead into one another; a car drives towards one that stands ahead, a bit aside."""
     angle = np.linspace(0.0, np.pi, 24)
     half = radius * np.stack([np.sin(angle), -np.cos(angle)], -1)
     road = make_road([half, -half], successors=[(0, 1), (1, 0)])

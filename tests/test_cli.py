@@ -237,7 +237,7 @@ def test_options_of_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str
     store = SegmentStore(tmp_path / "a")
     # Of 11.9 s, windows begin at 0, 2 … 8 s, the last being 3.9 s long; three cars each.
     assert len(store) == 5 * 3
-    assert store.num_maps == 1
+    assert len(store.map_hashes) == 1
     assert set(store.groups.tolist()) == {"DR_X_000"}
 
 

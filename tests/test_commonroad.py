@@ -147,7 +147,7 @@ def test_all_egos_differ_only_by_ego_and_name(path: Path, tmp_path: Path) -> Non
     with StoreWriter(tmp_path / "store") as writer:
         for each in segments[1:]:
             writer.append(each)
-    assert SegmentStore(tmp_path / "store").num_maps == 1
+    assert len(SegmentStore(tmp_path / "store").map_hashes) == 1
 
 
 # Lanelets

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from helpers_convert import FakeReader, scene
-from symphony.data.convert import Report, convert, expand, info
+from helpers_scenarionet import scenario, track
+from helpers_scenarionet import write as write_scenarionet
+from helpers_segments import crossing, straight_road
+from helpers_sources import off_road
+from symphony.data.builtin import builtin_store
+from symphony.data.convert import Report, convert, expand, info, merge
+from symphony.data.odd import crop
+from symphony.data.report import Skip
 from symphony.data.resample import resample, smooth
-from symphony.data.segment import content_hash
+from symphony.data.segment import Polylines, content_hash, validate
+from symphony.data.selection import road_points
 from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
 
 Write = Callable[..., Path]
@@ -103,12 +116,11 @@ def test_what_exists_is_not_written_over(logs: Write, out: Path, tmp_path: Path)
     assert SegmentStore(out).checksum() == checksum
 
 
-@pytest.mark.parametrize(
-    "bad", [{"rate": 0}, {"rate": float("nan")}, {"rate": float("inf")}, {"smooth": -1}, {"interactive": 0}]
-)
-def test_bad_arguments_are_named(logs: Write, out: Path, bad: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match=next(iter(bad))):
-        convert(FakeReader(), [logs("a.scene", "straight 1")], out, **bad)
+def test_bad_arguments_are_named(logs: Write, out: Path) -> None:
+    bad: list[tuple[str, Any]] = [("rate", 0), ("rate", float("nan")), ("smooth", -1), ("interactive", 0)]
+    for name, value in [*bad, ("radius", 0)]:
+        with pytest.raises(ConfigError, match=f"{name} must be between"):
+            convert(FakeReader(), [logs("a.scene", "straight 1")], out, **{name: value})
     with pytest.raises(ConfigError, match="unknown data source"):
         convert("nosuch", [logs("a.scene", "straight 1")], out)
     assert left(out) == []
@@ -162,3 +174,146 @@ def test_info_counts_what_is_there(logs: Write, out: Path) -> None:
     assert lonely["exclusion"] == "interactive_agents"
     assert (found["skipped"], found["exclusions"]["interactive_agents"]) == (2, 1)
     assert found["problems"] == {"tracks: # is not #": 1}
+
+
+# --- several stores as one -----------------------------------------------------------------------------------
+
+PARTS = [builtin_store("train"), builtin_store("test")]
+
+
+def test_the_merged_store_holds_every_segment_as_it_was(tmp_path: Path) -> None:
+    stores = [SegmentStore(path) for path in PARTS]
+    told: list[tuple[int, int]] = []
+    merged = merge(PARTS, tmp_path / "all", lambda done, total: told.append((done, total)))
+    merged.verify()
+    assert len(merged) == sum(map(len, stores)) == told[-1][0] == told[-1][1]
+    offset = 0
+    for store in stores:
+        for k in (0, len(store) - 1):
+            assert content_hash(merged[offset + k]) == content_hash(store[k])
+            assert merged.tags(offset + k) == store.tags(k)
+        offset += len(store)
+    assert merged.groups.tolist() == [name for store in stores for name in store.groups.tolist()]
+
+
+def test_a_merge_that_was_killed_is_begun_anew(tmp_path: Path) -> None:
+    with StoreWriter(tmp_path / "all.merging") as writer:
+        writer.copy(SegmentStore(PARTS[0]), 3)
+        with pytest.raises(DataError, match="another process"):
+            merge(PARTS[1:], tmp_path / "all")
+    assert merge(PARTS[1:], tmp_path / "all").checksum() == SegmentStore(PARTS[1]).checksum()
+    assert not (tmp_path / "all.merging").exists()
+
+
+def test_a_conversion_to_the_same_name_is_left_alone(tmp_path: Path) -> None:
+    logs = [tmp_path / name for name in ("a.scene", "b.scene")]
+    logs[0].write_text("straight 1")
+    logs[1].write_text("interrupt")
+    with pytest.raises(KeyboardInterrupt):
+        convert(FakeReader(), logs, tmp_path / "mine")
+    begun = {path: path.read_bytes() for path in (tmp_path / "mine.partial").rglob("*") if path.is_file()}
+    with pytest.raises(DataError, match="unfinished conversion to that name"):
+        merge(PARTS[1:], tmp_path / "mine")
+    assert {path: path.read_bytes() for path in begun} == begun
+
+
+def test_the_report_of_a_merged_store_joins_those_of_its_parts(tmp_path: Path) -> None:
+    reports = []
+    for k, name in enumerate("ab"):
+        with StoreWriter(tmp_path / name) as writer:
+            writer.append(SegmentStore(PARTS[k])[0])
+            report = Report(converted=1, files=1, overlaps=k + 1, odd={"jitter": 1}, skipped=[Skip(name)])
+            writer.write_report(report.to_json())
+        reports.append(report)
+    merged = merge([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
+    found = Report.from_json(merged.report)
+    assert (found.converted, found.files, found.overlaps, found.odd) == (2, 2, 3, {"jitter": 2})
+    assert [skip.message for skip in found.skipped] == ["a", "b"]
+    # So one that was cut short is seen.
+    index = tmp_path / "both" / "segments.idx"
+    index.write_bytes(index.read_bytes()[: index.stat().st_size // 2])
+    with pytest.raises(DataError, match="cut short"):
+        SegmentStore(tmp_path / "both")
+
+
+def test_the_same_segment_twice_another_time_step_and_what_is_there_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="in the store already"):
+        merge([PARTS[0], PARTS[0]], tmp_path / "twice")
+    assert not (tmp_path / "twice").exists()
+    store = SegmentStore(PARTS[0])
+    with StoreWriter(tmp_path / "slow") as writer:
+        writer.append(store[0].replace(dt=0.1, segment_id="slow"))
+    with pytest.raises(DataError, match=r"0\.1 s, 0\.2 s"):
+        merge([PARTS[1], tmp_path / "slow"], tmp_path / "mixed")
+    with pytest.raises(DataError, match="exists already"):
+        merge(PARTS, tmp_path / "slow")
+
+
+def test_a_store_that_is_not_finished_is_not_merged(tmp_path: Path) -> None:
+    store = SegmentStore(PARTS[0])
+    with StoreWriter(tmp_path / "half") as writer:
+        writer.copy(store, 0)
+        writer.write_report({"settings": {"segments": 9}, "generation": {"complete": False}})
+    with pytest.raises(DataError, match=r"half: holds 1 of 9 segments"):
+        merge([PARTS[1], tmp_path / "half"], tmp_path / "all")
+
+
+# --- cropping: what is near stays as it is, what is far goes ------------------------------------------------------
+
+
+def test_all_of_a_small_segment_stays() -> None:
+    for segment in (crossing(), straight_road(5)):
+        assert content_hash(crop(segment, 5000)) == content_hash(segment)
+
+
+@given(st.floats(5, 400), st.integers(0, 20))
+def test_what_stays_is_what_it_was(radius: float, seed: int) -> None:
+    segment = crossing(seed=seed)
+    found = validate(crop(segment, radius))
+    rows = np.flatnonzero(np.isin(segment.agent_id, found.agent_id))
+    for name in ("agent_id", "agent_type", "size", "position", "heading", "velocity", "valid"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(segment, name)[rows])
+    assert found.agent_id[found.ego] == segment.agent_id[segment.ego]
+    path = segment.position[segment.ego, segment.valid[segment.ego], :2]
+    for a in range(segment.num_agents):
+        spots = segment.position[a, segment.valid[a], :2]
+        away = np.hypot(*(spots[:, None] - path).transpose(2, 0, 1)).min() if len(spots) else np.inf
+        # The path has corners, its ends are round: both to the same millimetre.
+        if a in rows:
+            assert away < radius + 1
+        else:
+            assert away > radius - 1
+    for old, new, name in ((segment.road, found.road, n) for n in ("successors", "left_neighbors")):
+        kept = {
+            (a, b) for a, b in old.lane_id[getattr(old, name)].tolist() if {a, b} <= set(new.lane_id.tolist())
+        }
+        assert {(a, b) for a, b in new.lane_id[getattr(new, name)].tolist()} == kept
+    light = dict(zip(segment.road.lane_id[segment.signal_lane], segment.signal_state.tolist(), strict=True))
+    for lane, states in zip(found.road.lane_id[found.signal_lane], found.signal_state.tolist(), strict=True):
+        assert light[lane] == states
+
+
+def test_the_boundary_near_the_ego_is_as_it_was() -> None:
+    segment = crossing()
+    lines = [segment.road.boundary[k] for k in range(len(segment.road.boundary))]
+    far = [np.float32([(400 + 2 * k, 300, 0) for k in range(50)])]
+    whole = dataclasses.replace(segment.road, boundary=Polylines.of([*lines[:2], *far, *lines[2:], *far]))
+    found = crop(segment.replace(road=whole), 30)
+    assert len(found.road.boundary) == len(lines)
+    assert road_points(found) < road_points(segment.replace(road=whole))
+    path = segment.position[segment.ego, :, :2]
+    spots = np.concatenate([path + shift for shift in ((0, 0), (3, 0), (-3, 0), (0, 6), (0, -6))])
+    np.testing.assert_allclose(off_road(found.road, spots), off_road(segment.road, spots), atol=1e-4)
+
+
+def test_a_conversion_crops(tmp_path: Path) -> None:
+    tree = scenario()
+    tree["tracks"]["far"] = track(0, 30, 5)
+    file = write_scenarionet(tmp_path, tree)
+    convert("scenarionet", [file], tmp_path / "all", interactive=1)
+    report = convert("scenarionet", [file], tmp_path / "near", interactive=1, radius=9)
+    assert report.settings["radius"] == 9
+    whole, near = SegmentStore(tmp_path / "all")[0], SegmentStore(tmp_path / "near")[0]
+    # The ego drives 24 m along the first lane: the last one, from 60 m on, is gone.
+    assert (len(whole.road.lanes), len(near.road.lanes)) == (4, 2)
+    assert (near.num_agents, whole.num_agents) == (4, 5)

@@ -14,10 +14,6 @@ from typing import Any
 
 import pytest
 
-from helpers_convert import FakeReader
-from symphony.data import parts
-from symphony.data.convert import convert
-from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.parallel import WorkerError, ordered_map
 
@@ -101,7 +97,6 @@ def test_an_error_comes_through_whole_and_ends_the_workers(workers: int) -> None
     assert not multiprocessing.active_children()
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 def test_a_worker_that_is_killed_is_told() -> None:
     with pytest.raises(SymphonyError, match="a worker process ended before its task was done"):
         list(ordered_map(die_at_three, range(1000), workers=2))
@@ -158,9 +153,8 @@ if __name__ == "__main__":
 def test_workers_end_with_the_process_that_started_them(how: str, tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
     command = [sys.executable, str(tmp_path / "script.py"), str(Path(__file__).parent)]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, start_new_session=True, **pipes) as process:
         assert process.stdout is not None
         assert process.stderr is not None
         pids = [int(process.stdout.readline()) for _ in range(2)]
@@ -174,54 +168,30 @@ def test_workers_end_with_the_process_that_started_them(how: str, tmp_path: Path
     assert errors.count("Traceback") == (how == "SIGINT")
 
 
-@pytest.mark.parametrize("bad", [{"workers": 0}, {"engine": "dask"}])
-def test_bad_arguments_are_refused_at_once(bad: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match=next(iter(bad))):
-        ordered_map(slow_square, [1], **bad)
-
-
-def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_arguments_are_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ConfigError, match=r"pip install 'symphony-traffic\[ray\]'"):
-        ordered_map(slow_square, [1], engine="ray")
-
-
-@pytest.fixture(scope="module")
-def ray() -> Iterator[None]:
-    """A Ray of two workers on this machine."""
-    module = pytest.importorskip("ray")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.delenv("RAY_ADDRESS", raising=False)
-        patch.setenv("PYTHONPATH", str(Path(__file__).parent))  # for its workers
-        patch.setenv("RAY_worker_niceness", "0")  # 15 by default: on a busy machine they would hardly run
-        assert list(ordered_map(slow_square, [2], workers=2, engine="ray")) == [4]
-    yield
-    module.shutdown()
+    bad: list[tuple[dict[str, Any], str]] = [({"workers": 0}, "workers"), ({"engine": "dask"}, "engine")]
+    for options, message in [*bad, ({"engine": "ray"}, r"pip install 'symphony-traffic\[ray\]'")]:
+        with pytest.raises(ConfigError, match=message):
+            ordered_map(slow_square, [1], **options)
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("ray")
-def test_ray_gives_the_same() -> None:
-    tasks = Counted(20)
-    results = ordered_map(slow_square, tasks, workers=2, engine="ray")
-    assert next(results) == 0
-    assert tasks.taken == 4
-    assert list(results) == [k * k for k in range(1, 20)]
-    assert list(ordered_map(environment, ["OMP_NUM_THREADS"], engine="ray")) == ["1"]
-    with pytest.raises(DataError, match="file log, segment s, field agents: three"):
-        list(ordered_map(fail_at_three, range(10), workers=2, engine="ray"))
-    with pytest.raises(SymphonyError, match="a Ray worker failed"):
-        list(ordered_map(die_at_three, range(10), workers=2, engine="ray"))
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("ray")
-def test_ray_makes_the_same_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "PART_FILES", 1)
-    (tmp_path / "logs").mkdir()
-    for k in range(4):
-        (tmp_path / "logs" / f"{k}.scene").write_text(f"straight {k}\nbroken 1\ncrossing {k}")
-    convert(FakeReader(), [tmp_path / "logs"], tmp_path / "here")
-    convert(FakeReader(), [tmp_path / "logs"], tmp_path / "there", workers=2, engine="ray")
-    here, there = SegmentStore(tmp_path / "here"), SegmentStore(tmp_path / "there")
-    assert (here.ids, here.checksum(), here.report) == (there.ids, there.checksum(), there.report)
+def test_ray_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    ray = pytest.importorskip("ray")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # for its workers
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # 15 by default: on a busy machine they would hardly run
+    try:
+        tasks = Counted(20)
+        results = ordered_map(slow_square, tasks, workers=2, engine="ray")
+        assert next(results) == 0
+        assert tasks.taken == 4
+        assert list(results) == [k * k for k in range(1, 20)]
+        assert list(ordered_map(environment, ["OMP_NUM_THREADS"], engine="ray")) == ["1"]
+        with pytest.raises(DataError, match="file log, segment s, field agents: three"):
+            list(ordered_map(fail_at_three, range(10), workers=2, engine="ray"))
+        with pytest.raises(SymphonyError, match="a Ray worker failed"):
+            list(ordered_map(die_at_three, range(10), workers=2, engine="ray"))
+    finally:
+        ray.shutdown()

@@ -146,19 +146,12 @@ def test_the_heading_follows_the_motion_only_when_moving() -> None:
     np.testing.assert_allclose(fast.heading, 0.0, atol=1e-5)
     slow = smooth(along_x(np.full(40, 0.5), 0.2), 0.3)
     np.testing.assert_allclose(slow.heading, 0.2, atol=1e-5)
+    back = smooth(along_x(np.full(40, -5.0), 0.1), 0.3)  # keeps facing the same way
+    np.testing.assert_allclose(back.heading, 0.0, atol=1e-5)
+    around = smooth(along_x(np.full(40, 5.0), 4 * np.pi), 0.3)  # stays on the logged branch
+    np.testing.assert_allclose(around.heading, 4 * np.pi, atol=1e-5)
     starting = smooth(along_x(np.linspace(0, 6, 60), 0.2), 0.3)
     assert np.abs(np.diff(starting.heading)).max() < 0.05
-
-
-def test_a_reversing_car_keeps_facing_the_same_way() -> None:
-    new = smooth(along_x(np.full(40, -5.0), 0.1), 0.3)
-    np.testing.assert_allclose(new.heading, 0.0, atol=1e-5)
-
-
-def test_headings_stay_on_the_logged_branch() -> None:
-    log = along_x(np.full(40, 5.0), 0.0)
-    new = smooth(log.replace(heading=log.heading + np.float32(4 * np.pi)), 0.3)
-    np.testing.assert_allclose(new.heading, 4 * np.pi, atol=1e-5)
 
 
 @pytest.mark.parametrize("every", [1, 3])

@@ -1,4 +1,4 @@
-"""Who is interactive, and which segments are left out."""
+"""Who is interactive and what two vehicles are to each other, on hand-made paths; which segments are left out."""
 
 from __future__ import annotations
 
@@ -6,16 +6,234 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from helpers_segments import crossing, hide, make_road, make_segment, straight_road
+from helpers_segments import along, crossing, hide, make_road, make_segment, straight_road
+from symphony.data import selection as contexts
 from symphony.data.segment import AgentType, RunSegment
-from symphony.data.selection import interactive_agents, road_points, travel, usable
+from symphony.data.selection import (
+    CONFLICT_GAP,
+    Context,
+    choices,
+    exclusion,
+    interactive_agents,
+    interactive_choice,
+    relations,
+    road_points,
+    travel,
+)
 from symphony.errors import DataError
 
+STEPS, DT = 51, 0.2
+TIME = np.arange(STEPS) * DT
+Paths = list[tuple[Any, Any]]
 
-def scene(distances: list[float], speeds: list[float], **changes: Any) -> RunSegment:
+ARC = np.linspace(0, np.pi / 2, 20)
+NORTH = np.asarray([[0.0, -200], [0, 200]])
+EAST = np.asarray([[-200.0, 0], [200, 0]])
+BESIDE = NORTH + np.asarray([3.5, 0])
+"""The next lane to the right of NORTH."""
+ONCOMING = NORTH[::-1] + np.asarray([-3.5, 0])
+TURN_RIGHT_INTO_NORTH = np.concatenate(
+    [[[-100.0, 10]], np.stack([-10 + 10 * np.sin(ARC), 20 - 10 * np.cos(ARC)], -1), [[0, 200]]]
+)
+"""From the west into NORTH, which it reaches at y = 20, 100.7 m on."""
+TURN_LEFT_OFF_NORTH = np.concatenate(
+    [[[0.0, -200]], np.stack([-10 + 10 * np.cos(ARC), -20 + 10 * np.sin(ARC)], -1), [[-200, -10]]]
+)
+CHANGE_LANE = np.asarray([[3.5, -200], [3.5, -30], [0, 0], [0, 200]])
+
+
+def scene(paths: Paths, **changes: Any) -> RunSegment:
+    """Vehicles on polylines; (polyline, metres from its start at each step), the ego first."""
+    placed = [along(np.asarray(path, float), np.broadcast_to(driven, STEPS)) for path, driven in paths]
+    position = np.stack([each[0] for each in placed])
+    heading = np.stack([each[1] for each in placed])
+    velocity = np.gradient(position, DT, axis=1)
+    return make_segment(make_road([NORTH]), position, heading, velocity, DT, **changes)
+
+
+def north(y: float, speed: float = 8.0) -> Any:
+    """Metres driven on NORTH and what is parallel to it, from y."""
+    return 200 + y + speed * TIME
+
+
+CASES: dict[str, tuple[Context, Paths]] = {
+    # Each has the partner second; what follows is nearer, at first, and has less to do with the ego.
+    "turns in before": (
+        Context.MERGE,
+        [(NORTH, north(-30)), (TURN_RIGHT_INTO_NORTH, 100.7 - 34 + 8 * TIME), (BESIDE, north(-28))],
+    ),
+    "turns in after": (
+        Context.MERGE,
+        [(NORTH, north(-10)), (TURN_RIGHT_INTO_NORTH, 100.7 - 50 + 8 * TIME), (NORTH, north(-25))],
+    ),
+    "changes lane ahead": (
+        Context.MERGE,
+        [(NORTH, north(-60, 10)), (CHANGE_LANE, north(-42, 10)), (NORTH, north(-75, 10))],
+    ),
+    "ego changes lane": (
+        Context.MERGE,
+        [(CHANGE_LANE, north(-42, 10)), (NORTH, north(-60, 10)), (BESIDE, north(-57, 10))],
+    ),
+    "crosses": (
+        Context.CROSSING,
+        [(NORTH, north(-40)), (EAST, 200 - 60 + 8 * TIME), (NORTH, north(-55)), (ONCOMING, 220 + 8 * TIME)],
+    ),
+    "crosses from a stop": (
+        Context.CROSSING,
+        [(NORTH, north(-20)), (EAST, 200 - 9 + np.maximum(TIME - 3, 0) ** 2), (NORTH, north(-35))],
+    ),
+    "leads": (Context.LEADER, [(NORTH, north(-60)), (NORTH, north(-44)), (BESIDE, north(-58))]),
+    "leads and turns off": (
+        Context.LEADER,
+        [(NORTH, north(-60)), (TURN_LEFT_OFF_NORTH, north(-44, 6)), (BESIDE, north(-58))],
+    ),
+    "leads around a corner": (
+        Context.LEADER,
+        [(TURN_LEFT_OFF_NORTH, north(-45)), (TURN_LEFT_OFF_NORTH, north(-25)), (BESIDE, north(-43))],
+    ),
+    "leads in a queue": (
+        Context.LEADER,
+        [
+            (NORTH, north(-20, 0) + np.minimum(0.5 * TIME, 4)),
+            (NORTH, north(-12, 0) + np.minimum(0.5 * TIME, 3)),
+            (BESIDE, north(-19, 0) + 0.5 * TIME),
+        ],
+    ),
+    "follows": (Context.FOLLOWER, [(NORTH, north(-40)), (NORTH, north(-56)), (BESIDE, north(-42))]),
+    "follows closer than the leader leads": (
+        Context.FOLLOWER,
+        [(NORTH, north(-40)), (NORTH, north(-52)), (NORTH, north(-20))],
+    ),
+    "next lane": (Context.NEAREST, [(NORTH, north(-40)), (BESIDE, north(-30)), (NORTH, north(40))]),
+    "head on": (Context.NEAREST, [(NORTH, north(-40)), (NORTH[::-1], 200 + 8 * TIME)]),
+    "oncoming": (Context.NEAREST, [(NORTH, north(-40)), (ONCOMING, 200 + 8 * TIME)]),
+    "crosses long before": (Context.NEAREST, [(NORTH, north(-60)), (EAST, 200 - 8 + 8 * TIME)]),
+    "far ahead": (Context.NEAREST, [(NORTH, north(-60, 8)), (NORTH, north(-20, 8))]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_context_is_what_happens(case: str) -> None:
+    context, paths = CASES[case]
+    choice = interactive_choice(scene(paths), 2)
+    assert choice.context == context
+    assert choice.agents.tolist() == [0, 1]
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.sampled_from(sorted(CASES)),
+    st.floats(-np.pi, np.pi),
+    st.tuples(st.floats(-500, 500), st.floats(-500, 500)),
+    st.randoms(use_true_random=False),
+)
+def test_frame_and_order_do_not_matter(case: str, angle: float, shift: Any, random: Any) -> None:
+    context, paths = CASES[case]
+    segment = scene(paths)
+    order = random.sample(range(len(paths)), len(paths))
+    turn = np.asarray([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    moved = scene(paths).position.copy()
+    moved[..., :2] = moved[..., :2] @ turn + shift
+    again = segment.replace(
+        ego=order.index(0),
+        agent_id=segment.agent_id[order],
+        position=moved[order].astype(np.float32),
+        heading=np.angle(np.exp(1j * (segment.heading + angle))).astype(np.float32)[order],
+        velocity=(segment.velocity @ turn).astype(np.float32)[order],
+    )
+    choice = interactive_choice(again, 2)
+    assert choice.context == context
+    assert again.agent_id[choice.agents].tolist() == segment.agent_id[:2].tolist()
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.floats(3, 25),
+    st.floats(3, 25),
+    st.floats(np.deg2rad(40), np.deg2rad(140)),
+    st.booleans(),
+    st.floats(-8, 8),
+)
+def test_crossing_is_a_matter_of_time(
+    speed: float, other_speed: float, angle: float, right: bool, gap: float
+) -> None:
+    """Whatever the speeds and the angle, two that pass one place within the limit cross."""
+    # The place is as wide as half a step and half a metre of either: at an acute angle a slow one needs time for it.
+    mine = (speed * DT / 2 + 0.5) / np.sin(angle)
+    theirs = mine * abs(np.cos(angle)) + other_speed * DT / 2 + 0.5
+    assume(abs(abs(gap) - CONFLICT_GAP) > mine / speed + theirs / other_speed + DT)
+    # Both pass the place within the window, the first of them after a second.
+    arrival, other_arrival = 1 + max(0.0, -gap), 1 + max(0.0, gap)
+    heading = np.pi / 2 + (-angle if right else angle)
+    way = np.asarray([np.cos(heading), np.sin(heading)])
+    path = np.stack([-400 * way, 400 * way])
+    paths = [(2 * NORTH, 400 + speed * (TIME - arrival)), (path, 400 + other_speed * (TIME - other_arrival))]
+    segment = scene(paths)
+    expected = Context.CROSSING if abs(gap) <= CONFLICT_GAP else Context.NEAREST
+    assert interactive_choice(segment, 2).context == expected
+    found = relations(segment, np.asarray([1])).crossing[0]
+    if expected == Context.CROSSING:
+        assert found <= abs(gap) + DT
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([crossing, straight_road]))
+def test_relations_are_mutual(seed: int, make: Any) -> None:
+    """Leading is following seen from the other; crossing has no sides."""
+    segment = make(num_agents=5, seed=seed)
+    for other in range(1, 5):
+        here = relations(segment, np.asarray([other]))
+        there = relations(segment.replace(ego=other), np.asarray([0]))
+        assert np.isfinite(here.leader[0]) == np.isfinite(there.follower[0])
+        assert np.isfinite(here.follower[0]) == np.isfinite(there.leader[0])
+        assert np.isfinite(here.crossing[0]) == np.isfinite(there.crossing[0])
+
+
+def test_a_partner_that_is_seen_throughout_goes_first() -> None:
+    context, paths = CASES["crosses"]
+    segment = hide(scene(paths), 1, slice(STEPS - 1, STEPS))
+    choice = interactive_choice(segment, 2)
+    assert (choice.context, choice.agents.tolist()) == (Context.FOLLOWER, [0, 2])
+    alone = hide(scene(paths[:2]), 1, slice(STEPS - 1, STEPS))
+    assert interactive_choice(alone, 2).context == context
+
+
+def test_a_gap_in_the_track_and_no_map_do_no_harm() -> None:
+    context, paths = CASES["turns in before"]
+    segment = scene(paths[:2]).replace(road=make_road([NORTH[:1]]))
+    for agent in (0, 1):
+        assert interactive_choice(hide(segment, agent, slice(10, 13)), 2).context == context
+
+
+def test_choices_are_counted_and_named() -> None:
+    segments = [scene(paths, segment_id=name) for name, (_, paths) in CASES.items()]
+    found = choices([*segments, scene([(NORTH, north(0))], segment_id="alone")], 2)
+    assert found["count"] == 2
+    assert found["too_few"] == 1
+    assert sum(found["contexts"].values()) == len(found["segments"]) == len(CASES)
+    assert list(found["contexts"]) == ["merge", "crossing", "leader", "follower", "nearest"]
+    for name, (context, _) in CASES.items():
+        assert found["segments"][name] == {"context": context, "agents": [7, 8]}
+
+
+@pytest.mark.parametrize("tile", [60, 5 * STEPS])
+def test_tiles_of_any_size_give_the_same(tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    turns, crosses = (TURN_RIGHT_INTO_NORTH, 12 * TIME + 60), (EAST, 15 * TIME + 120)
+    cars = scene([(NORTH, 30 * TIME + 50), turns, crosses, (NORTH, 80)])
+    segments = [cars, crossing(6, steps=60, seed=3), straight_road(9, steps=40)]
+    whole = [relations(each, np.arange(1, each.num_agents)) for each in segments]
+    monkeypatch.setattr(contexts, "TILE", tile)
+    for segment, expected in zip(segments, whole, strict=True):
+        found = relations(segment, np.arange(1, segment.num_agents))
+        np.testing.assert_array_equal(found, expected)
+    assert any(np.isfinite(each.merge).any() for each in whole)
+    assert any(np.isfinite(each.crossing).any() for each in whole)
+
+
+def abreast(distances: list[float], speeds: list[float], **changes: Any) -> RunSegment:
     """The ego at x = 0 and others at given distances, all going along +y; 6 steps of 1 s."""
     x = np.asarray([0.0, *distances])
     v = np.asarray([1.0, *speeds])
@@ -31,14 +249,14 @@ def ints(*values: int) -> np.ndarray:
 
 
 def test_the_nearest_that_moves_is_the_partner() -> None:
-    segment = scene([30, 5, 10, 20], [2, 0.3, 2, 2])
+    segment = abreast([30, 5, 10, 20], [2, 0.3, 2, 2])
     assert interactive_agents(segment, 2).tolist() == [0, 3]
     assert interactive_agents(segment, 4).tolist() == [0, 3, 4, 1]
     assert interactive_agents(segment, 1).tolist() == [0]
 
 
 def test_marks_of_the_source_come_first() -> None:
-    segment = scene([30, 5, 10, 20], [2, 0.0, 2, 2])
+    segment = abreast([30, 5, 10, 20], [2, 0.0, 2, 2])
     assert interactive_agents(segment.replace(interest=ints(0, 1)), 2).tolist() == [0, 1]
     assert interactive_agents(segment.replace(interest=ints(1), predict=ints(4)), 2).tolist() == [0, 1]
     assert interactive_agents(segment.replace(interest=ints(0), predict=ints(4)), 2).tolist() == [0, 4]
@@ -50,7 +268,7 @@ def test_marks_of_the_source_come_first() -> None:
 
 
 def test_only_vehicles_seen_at_the_first_step() -> None:
-    segment = scene([5, 6, 7, 8], [2, 2, 2, 2])
+    segment = abreast([5, 6, 7, 8], [2, 2, 2, 2])
     kinds = segment.agent_type.copy()
     kinds[1] = AgentType.PEDESTRIAN
     kinds[2] = AgentType.CYCLIST
@@ -59,12 +277,12 @@ def test_only_vehicles_seen_at_the_first_step() -> None:
 
 
 def test_those_seen_throughout_are_preferred() -> None:
-    segment = hide(scene([5, 6, 7], [2, 2, 2]), 1, slice(5, 6))
+    segment = hide(abreast([5, 6, 7], [2, 2, 2]), 1, slice(5, 6))
     assert interactive_agents(segment, 4).tolist() == [0, 2, 3, 1]
 
 
 def test_travel_is_where_an_agent_got_not_how_much_it_shook() -> None:
-    segment = scene([5, 6], [0, 2])
+    segment = abreast([5, 6], [0, 2])
     shaken = segment.position.copy()
     shaken[1, :, 0] += np.tile([0, 0.9], 3)
     segment = hide(segment.replace(position=shaken), 2, slice(0, 2))
@@ -85,32 +303,36 @@ def test_the_order_of_agents_does_not_matter(random: Any, count: int, make: Any)
     assert mixed.agent_id[again].tolist() == segment.agent_id[chosen].tolist()
 
 
+def excluded(segment: RunSegment, count: int) -> tuple[str, str | None, str]:
+    """Kind, field and message of what excludes a segment."""
+    found = exclusion(segment, count)
+    if found is None:
+        return "", "", ""
+    kind, error = found
+    assert (error.segment, error.file) == (segment.segment_id, segment.file or None)
+    return kind, error.field, error.message
+
+
 def test_too_few_are_refused() -> None:
-    segment = scene([5, 6, 7], [2, 2, 0], file="log.xml")
-    for check in (interactive_agents, usable):
-        with pytest.raises(DataError, match="needs 4 interactive agents at its first step, has 3") as error:
-            check(segment, 4)
-        assert (error.value.field, error.value.segment, error.value.file) == ("agents", "made", "log.xml")
+    segment = abreast([5, 6, 7], [2, 2, 0], file="log.xml")
+    message = "needs 4 interactive agents at its first step, has 3"
+    assert excluded(segment, 4) == ("interactive_agents", "agents", message)
     with pytest.raises(DataError, match="has no ego"):
         interactive_agents(hide(segment, 0, slice(0, 1)), 2)
 
 
 def test_crowds_are_refused() -> None:
-    segment = scene([5.0 + k for k in range(258)], [2.0] * 258)
-    with pytest.raises(DataError, match="257 playback agents, at most 256") as error:
-        usable(segment, 2)
-    assert error.value.field == "agents"
-    usable(segment, 3)
-    usable(hide(segment, 100, slice(None)), 2)  # never seen
+    segment = abreast([5.0 + k for k in range(258)], [2.0] * 258)
+    message = "257 playback agents, at most 256 allowed"
+    assert excluded(segment, 2) == ("playback_agents", "agents", message)
+    assert excluded(segment, 3) == excluded(hide(segment, 100, slice(None)), 2) == ("", "", "")  # never seen
 
 
 def test_large_maps_are_refused_by_length_not_by_density() -> None:
     def with_lane(length: float, spacing: float) -> RunSegment:
         x = np.linspace(0, length, round(length / spacing) + 1)
-        return scene([5], [2]).replace(road=make_road([np.stack([x, 0 * x], -1)]))
+        return abreast([5], [2]).replace(road=make_road([np.stack([x, 0 * x], -1)]))
 
     assert road_points(with_lane(100, 0.1)) == road_points(with_lane(100, 50)) == 51
-    usable(with_lane(19_990, 0.5), 2)
-    with pytest.raises(DataError, match="at most 10000") as error:
-        usable(with_lane(20_010, 50), 2)
-    assert error.value.field == "road"
+    assert excluded(with_lane(19_990, 0.5), 2) == ("", "", "")
+    assert excluded(with_lane(20_010, 50), 2)[:2] == ("roadgraph_points", "road")

@@ -87,21 +87,15 @@ def test_groups_and_tags_come_back_and_change_no_hash(folder: Path, tmp_path: Pa
 def test_a_shared_map_is_stored_once(folder: Path) -> None:
     found = [*(crossing(seed=k) for k in range(4)), straight_road()]
     fill(folder, found[:2])
-    fill(folder, found[2:], append=True)
-    store = SegmentStore(folder)
-    assert (store.num_maps, store.map_index.tolist()) == (2, [0, 0, 0, 0, 1])
-    lanes = sum(len(store.road(k).lanes.points) for k in range(2))
-    assert (folder / "columns" / "lanes.points.bin").stat().st_size == lanes * 12
-    assert hashes(store) == hashes(found)
-
-
-def test_arrays_are_read_only_views_of_the_files(folder: Path) -> None:
-    fill(folder, [crossing()])
-    segment = SegmentStore(folder)[0]
-    for array in (segment.position, segment.valid, segment.road.lanes.points, segment.signal_state):
+    store = fill(folder, found[2:], append=True)
+    for array in (store[0].position, store[0].valid, store[0].road.lanes.points):
         assert not array.flags.owndata
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0
+    assert (len(store.map_hashes), store.map_index.tolist()) == (2, [0, 0, 0, 0, 1])
+    lanes = sum(len(store.road(k).lanes.points) for k in range(2))
+    assert (folder / "columns" / "lanes.points.bin").stat().st_size == lanes * 12
+    assert hashes(store) == hashes(found)
 
 
 def test_checksum_ignores_order_and_layout_and_report(tmp_path: Path) -> None:

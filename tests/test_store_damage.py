@@ -34,20 +34,17 @@ def change(path: Path, offset: int, data: bytes) -> None:
         file.write(data)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_unknown_headers_are_refused(folder: Path) -> None:
+    for text, message in (
         ('{"format": "symphony segment store", "version": 2}', "reads a symphony segment store of version 1"),
         ('{"format": "zarr", "version": 1}', "is 'zarr'"),
         ("{", "cannot be read as JSON"),
         ("[]", "not an object"),
-    ],
-)
-def test_unknown_headers_are_refused(folder: Path, text: str, message: str) -> None:
-    (folder / "store.json").write_text(text)
-    for use in (SegmentStore, lambda path: StoreWriter(path, append=True)):
-        with pytest.raises(DataError, match=message):
-            use(folder)
+    ):
+        (folder / "store.json").write_text(text)
+        for use in (SegmentStore, lambda path: StoreWriter(path, append=True)):
+            with pytest.raises(DataError, match=message):
+                use(folder)
 
 
 def test_every_missing_or_short_file_is_named(tmp_path: Path) -> None:

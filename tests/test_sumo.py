@@ -15,7 +15,7 @@ from symphony.data.builtin import builtin_store
 from symphony.data.conformance import check_segments
 from symphony.data.generate import Plan, generate
 from symphony.data.segment import RoadMap, RunSegment, SignalState, content_hash
-from symphony.data.selection import MOVING, interactive_agents, travel, usable
+from symphony.data.selection import MOVING, exclusion, interactive_agents, travel
 from symphony.data.sources import sumo
 from symphony.data.sources.sumo import extract, process
 from symphony.data.sources.sumo.networks import kind_name, own_network, town
@@ -75,7 +75,7 @@ def test_segments_conform_and_keep_the_exclusions(segments: list[RunSegment]) ->
     report = check_segments(segments)
     assert report.numbers["off_road"] == 0
     for segment in segments:
-        usable(segment, 2)
+        assert exclusion(segment, 2) is None
         pair = interactive_agents(segment, 2)
         assert segment.valid[pair].all()
         assert (travel(segment)[pair] > MOVING).all()
@@ -279,7 +279,9 @@ def test_builtin_sets_are_small_varied_and_apart() -> None:
     assert len(networks["test"]) >= 5
     assert not networks["train"] & networks["test"]
     assert not set(stores["train"].ids) & set(stores["test"].ids)
-    roads_of = [{content_hash(store.road(k)) for k in range(store.num_maps)} for store in stores.values()]  # type: ignore[arg-type]
+    roads_of = [
+        {content_hash(store.road(k)) for k in range(len(store.map_hashes))} for store in stores.values()
+    ]  # type: ignore[arg-type]
     assert not roads_of[0] & roads_of[1]
     for store in stores.values():
         store.verify()

@@ -112,8 +112,8 @@ def test_what_is_no_file_needs_no_lock(tmp_path: Path) -> None:
         lock_file(tmp_path / "link")
 
 
-def hammer(folder: Path, times: int) -> int:
-    """Take a lock and give it back, again and again; whether two had it at once."""
+def hammer(folder: Path, times: int) -> None:
+    """Take a lock and give it back, again and again; fails if two have it at once."""
     had = 0
     while had < times:
         try:
@@ -123,7 +123,6 @@ def hammer(folder: Path, times: int) -> int:
                 had += 1
         except DataError:
             continue
-    return 0
 
 
 def test_no_two_have_it_at_once(tmp_path: Path) -> None:

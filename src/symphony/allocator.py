@@ -21,9 +21,8 @@ def tune() -> bool:
     trim_threshold, top_pad, mmap_threshold = -1, -2, -3
     # Older versions take no mapping threshold above 32 MiB.
     mapped = library.mallopt(mmap_threshold, 1 << 30) or library.mallopt(mmap_threshold, 1 << 25)
-    return bool(
-        mapped and library.mallopt(trim_threshold, (1 << 31) - 1) and library.mallopt(top_pad, 1 << 26)
-    )
+    rest = library.mallopt(trim_threshold, (1 << 31) - 1) and library.mallopt(top_pad, 1 << 26)
+    return bool(mapped and rest)
 
 
 def release() -> bool:
@@ -39,8 +38,7 @@ def release() -> bool:
 def _ours() -> ctypes.CDLL | None:
     """The C library, if it is glibc and nobody has said how it shall keep memory."""
     variables = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_TOP_PAD_", "MALLOC_MMAP_THRESHOLD_")
-    said = os.environ.get("SYMPHONY_MALLOPT", "1") in {"", "0"} or any(
-        name in os.environ for name in variables
-    )
+    said = [name for name in variables if name in os.environ]
+    said += ["off"] if os.environ.get("SYMPHONY_MALLOPT", "1") in {"", "0"} else []
     glibc = platform.system() == "Linux" and platform.libc_ver()[0] == "glibc"
     return ctypes.CDLL(None) if glibc and not said else None

@@ -39,7 +39,7 @@ def replacing(path: Path) -> Iterator[Path]:
             yield place
             return
         _remove_drafts(place)
-        draft = _draft(place)
+        draft = place.with_name(f".{place.stem}.{os.getpid()}.new{place.suffix}")
         try:
             yield draft
             with draft.open("rb+") as file:
@@ -53,10 +53,6 @@ def _place(path: Path) -> Path:
     place = Path(os.path.realpath(path))
     place.parent.mkdir(parents=True, exist_ok=True)
     return place
-
-
-def _draft(place: Path) -> Path:
-    return place.with_name(f".{place.stem}.{os.getpid()}.new{place.suffix}")
 
 
 def _remove_drafts(place: Path) -> None:

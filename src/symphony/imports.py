@@ -27,8 +27,15 @@ def load_object(path: str, *, here: bool = True) -> Any:
         ConfigError: if there is no such module, file or name.
     """
     module, _, name = path.rpartition(":")
+    file, paths = module.endswith(".py"), {os.getcwd(), ""}
     try:
-        found: Any = _file(Path(module).resolve()) if module.endswith(".py") else _module(module, here)
+        try:
+            found: Any = _file(Path(module).resolve()) if file else importlib.import_module(module)
+        except ModuleNotFoundError:
+            if file or not here or not paths.isdisjoint(sys.path):
+                raise
+            sys.path.append(os.getcwd())
+            found = importlib.import_module(module)
         for part in name.split("."):
             found = getattr(found, part)
     except (ImportError, AttributeError, ValueError) as error:
@@ -36,16 +43,6 @@ def load_object(path: str, *, here: bool = True) -> Any:
     except (Exception, SystemExit) as error:  # whatever a user's module raises
         raise ConfigError(f"can't import '{path}': {type(error).__name__}: {error}") from error
     return found
-
-
-def _module(name: str, here: bool) -> ModuleType:
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError:
-        if not here or os.getcwd() in sys.path or "" in sys.path:
-            raise
-        sys.path.append(os.getcwd())
-        return importlib.import_module(name)
 
 
 def _file(path: Path) -> ModuleType:

@@ -27,10 +27,7 @@ PERSONA: Key = ("agents", "persona")  # [..., N, 2]: headway and speed, from -1 
 ACTION: Key = ("agents", "action")  # [..., N] int64 (bicycle) or [..., N, 2] (displacement)
 LOGITS: Key = ("agents", "logits")
 LOG_PROB: Key = ("agents", "action_log_prob")  # [..., N]: of the action, where it is asked for
-NOISE: Key = (
-    "agents",
-    "noise",
-)  # [..., N] or [..., N, 2] in (0, 1): the random numbers that decide an action
+NOISE: Key = ("agents", "noise")  # [..., N] or [..., N, 2] in (0, 1): decides an action
 REWARD: Key = ("agents", "reward")
 COLLISION: Key = ("agents", "collision")  # [..., N, 1] bool: box overlaps another valid box at this step
 OFFROAD: Key = ("agents", "offroad")  # [..., N, 1] bool: box centre off the drivable area at this step
@@ -45,17 +42,9 @@ POINTS: Key = ("agents", "observation", "points")  # [..., N, P, Fp]
 POINTS_MASK: Key = ("agents", "observation", "points_mask")
 ROUTE: Key = ("agents", "observation", "route")  # [..., N, Fr]: the agent's route as it observes it
 GAP: Key = ("agents", "observation", "gap")  # [..., N, O]: signed gap to the box of each object, metres
-GAP_AHEAD: Key = (
-    "agents",
-    "observation",
-    "gap_ahead",
-)  # [..., N, O, H]: at times ahead, at constant velocity
-ALONG: Key = (
-    "agents",
-    "observation",
-    "along",
-)  # [..., N, O, Fa]: where each object is along the agent's route
-LIGHTS: Key = ("agents", "observation", "lights")  # [..., N, L, Fp]: the nearest lights, as points
+GAP_AHEAD: Key = ("agents", "observation", "gap_ahead")  # [..., N, O, H]: at times ahead
+ALONG: Key = ("agents", "observation", "along")  # [..., N, O, Fa]: along the route
+LIGHTS: Key = ("agents", "observation", "lights")  # [..., N, L, Fp]: nearest, as points
 LIGHTS_MASK: Key = ("agents", "observation", "lights_mask")
 # [..., N, 5]: signed distance of box centre and corners to the edge of the road, metres, positive off it.
 ROAD: Key = ("agents", "observation", "road")

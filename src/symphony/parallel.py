@@ -55,7 +55,8 @@ def ordered_map(
     """Apply a function to every task; results come in the order of the tasks, whoever is done first.
 
     Tasks are taken from the iterable as results are asked for, at most ``2 * workers`` ahead. One local worker is
-    this very process. When an error, an interrupt or ``close`` cuts it short, the tasks under way are abandoned.
+    this very process. When an error, an interrupt or ``close`` cuts it short, the tasks under way are abandoned. What
+    ``function`` raises comes through; a worker that dies is a :class:`SymphonyError`.
 
     Args:
         function: a function of a module (it is pickled, and so are tasks and results).
@@ -64,11 +65,6 @@ def ordered_map(
         engine: ``local`` for processes of this machine, ``ray`` for Ray: the cluster at ``RAY_ADDRESS`` or the
             one ``ray.init`` was called for, else one on this machine.
         imports: modules that the tasks need beside the function's own, see :func:`get_ready`.
-
-    Raises:
-        ConfigError: ``workers`` or ``engine`` can't be used, or Ray is not installed.
-        WorkerError: a worker process of this machine did, while iterating.
-        SymphonyError: a worker of Ray failed, while iterating; what ``function`` raises comes through unchanged.
     """
     if workers < 1:
         raise ConfigError(f"workers must be at least 1, is {workers}")

@@ -61,16 +61,15 @@ BOMB = 32 << 20
 
 
 def reader(name: str, good: Callable[[Path], Path]) -> Target:
-    """A log format and what writes its files; those whose suffix has no mutation of its own are changed as bytes."""
+    """A log format and what writes its files."""
+    return Target(written(good), _change_some, functools.partial(_read, name))
 
-    def mutate(rng: Rng, files: Files) -> Files:
-        which = {change.pick(rng, list(files)) for _ in range(1 + (rng.random() < 0.2))}
-        return {
-            k: BY_SUFFIX.get(k.rpartition(".")[2], change.bytes_)(rng, v) if k in which else v
-            for k, v in files.items()
-        }
 
-    return Target(written(good), mutate, functools.partial(_read, name))
+def _change_some(rng: Rng, files: Files) -> Files:
+    """One or two files changed; those whose suffix has no mutation of its own as bytes."""
+    which = {change.pick(rng, list(files)) for _ in range(1 + (rng.random() < 0.2))}
+    ways = {name: BY_SUFFIX.get(name.rpartition(".")[2], change.bytes_) for name in files}
+    return {name: ways[name](rng, data) if name in which else data for name, data in files.items()}
 
 
 def _read(name: str, folder: Path, file: str) -> tuple[str, str]:
@@ -327,11 +326,6 @@ def _configuration(folder: Path) -> Path:
     return folder / "config.json"
 
 
-def _change_one(rng: Rng, files: Files) -> Files:
-    name = change.pick(rng, list(files))
-    return {**files, name: change.json_(rng, files[name])}
-
-
 def _read_configuration(folder: Path, _: str) -> tuple[str, str]:
     try:
         to_json(read_json(TrainConfig, folder / "config.json"))
@@ -527,7 +521,7 @@ TARGETS: dict[str, Target] = {
     "scenarionet": reader("scenarionet", scenarionet),
     "store": Target(written(_store), _change_store, _read_store),
     "checkpoint": Target(written(_checkpoint), _change_checkpoint, _load_checkpoint),
-    "configuration": Target(written(_configuration), _change_one, _read_configuration),
+    "configuration": Target(written(_configuration), _change_some, _read_configuration),
     "submission": Target(written(_submission), _change_submission, _check_submission),
     "rollouts": Target(written(_rollouts), _change_rollouts, _read_rollouts),
 }

@@ -19,6 +19,7 @@ import resource
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
@@ -28,7 +29,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 PACKAGE = ROOT / "src" / "symphony"
-ROOMS = (
+ROOMS = [
     "geometry",
     "roadgraph",
     "envs",
@@ -38,11 +39,10 @@ ROOMS = (
     "learning",
     "rollouts",
     "metrics",
-)
+]
 """Where changes are made unless others are asked for: rooms that compute."""
 SECONDS = 300
 """CPU time that the tests may take with a change: one that makes them go on for ever is noticed, too."""
-QUIET = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
 OPERATORS: dict[type, type] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or, ast.Or: ast.And,
@@ -56,35 +56,22 @@ def changes(tree: ast.Module) -> Iterator[tuple[str, int, Any]]:
     """Every possible change inside functions: what, in which line, and a function that makes it."""
     for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
         for node in (inner for statement in function.body for inner in ast.walk(statement)):
-            line = getattr(node, "lineno", function.lineno)
+            line, new = getattr(node, "lineno", function.lineno), None
             if isinstance(node, ast.Compare) and type(node.ops[0]) in OPERATORS:
-                new = OPERATORS[type(node.ops[0])]()
-                yield (
-                    f"comparison becomes {type(new).__name__}",
-                    line,
-                    lambda n=node, o=new: n.ops.__setitem__(0, o),
-                )
+                new = "ops", [OPERATORS[type(node.ops[0])](), *node.ops[1:]]
             elif isinstance(node, ast.BinOp | ast.BoolOp) and type(node.op) in OPERATORS:
-                new = OPERATORS[type(node.op)]()
-                yield (
-                    f"operator becomes {type(new).__name__}",
-                    line,
-                    lambda n=node, o=new: setattr(n, "op", o),
-                )
+                new = "op", OPERATORS[type(node.op)]()
             elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
-                yield (
-                    f"{node.value} becomes {node.value + 1}",
-                    line,
-                    lambda n=node: setattr(n, "value", n.value + 1),
-                )
+                new = "value", node.value + 1
             elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not | ast.Invert):
-                yield "sign or negation gone", line, lambda n=node: setattr(n, "op", ast.UAdd())
+                new = "op", ast.UAdd()
             elif isinstance(node, ast.Attribute) and node.attr in NAMES:
-                yield (
-                    f"{node.attr} becomes {NAMES[node.attr]}",
-                    line,
-                    lambda n=node: setattr(n, "attr", NAMES[n.attr]),
-                )
+                new = "attr", NAMES[node.attr]
+            if new is not None:
+                name, value = new
+                shown = value[0] if isinstance(value, list) else value
+                shown = type(shown).__name__ if isinstance(shown, ast.AST) else shown
+                yield f"{ast.unparse(node)[:60]}: {name} becomes {shown}", line, partial(setattr, node, *new)
 
 
 def replace_code(module: ModuleType, source: ast.Module) -> None:
@@ -133,16 +120,9 @@ def noticed(module: ModuleType, number: int | None, files: Sequence[str]) -> boo
 
 def modules(names: Sequence[str]) -> list[str]:
     """The modules of rooms, such as ``envs``, and those that are named themselves, such as ``envs.flags``."""
-    found = []
-    for name in names:
-        place = PACKAGE / name.replace(".", "/")
-        files = sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
-        found += [
-            ".".join(file.relative_to(PACKAGE).with_suffix("").parts)
-            for file in files
-            if file.stem != "__init__"
-        ]
-    return found
+    places = [PACKAGE / name.replace(".", "/") for name in names]
+    files = [f for p in places for f in (sorted(p.rglob("*.py")) if p.is_dir() else [p.with_suffix(".py")])]
+    return [".".join(f.relative_to(PACKAGE).with_suffix("").parts) for f in files if f.stem != "__init__"]
 
 
 def tests_of(module: str) -> list[str]:
@@ -150,9 +130,7 @@ def tests_of(module: str) -> list[str]:
 
     Those that have its name come first, as the first test that fails is enough.
     """
-    texts = {
-        str(file): file.read_text(encoding="utf-8") for file in sorted((ROOT / "tests").rglob("test_*.py"))
-    }
+    texts = {str(file): file.read_text() for file in sorted((ROOT / "tests").rglob("test_*.py"))}
     for name in (module, module.partition(".")[0]):
         found = [file for file, text in texts.items() if re.search(rf"\bsymphony\.{re.escape(name)}\b", text)]
         if found:
@@ -163,7 +141,8 @@ def tests_of(module: str) -> list[str]:
 def tests(files: Sequence[str]) -> int:
     """Run files of tests quietly."""
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        return int(pytest.main([*files, "-x", "-q", "-p", "no:cacheprovider", *QUIET]))
+        quiet = ("-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+        return int(pytest.main([*files, "-x", "-q", *quiet]))
 
 
 def main(args: list[str] | None = None) -> int:

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import shapely
@@ -25,68 +25,41 @@ from symphony.errors import DataError
 
 Doubles = NDArray[np.float64]
 
-MOVING = 3.0
-"""m/s above which speeds and headings are compared."""
-SPAN = 1.0
-"""Seconds over which positions and velocities are compared: from step to step, real positions jitter by more than
-velocities differ between units."""
-BESIDE = 2.5
-"""Metres within which a moving vehicle should find a lane that runs its way, within 0.6 rad."""
+MOVING = 3.0  # m/s above which speeds and headings are compared
+SPAN = 1.0  # seconds over which positions and velocities are compared: from step to step, positions jitter
+BESIDE = 2.5  # metres within which a moving vehicle should find a lane that runs its way, within 0.6 rad
 
 
-class Range(NamedTuple):
-    """Where a number must lie: the check it belongs to, least and most, how values are pooled, what it is.
-
-    An ``optional`` one may have nothing to be taken from.
-    """
-
-    check: str
-    low: float
-    high: float
-    pool: Any
-    says: str
-    optional: bool = False
-
-
-RANGES: dict[str, Range] = {
-    "dt": Range("time step", 0.01, 1.0, np.median, "median time step in s"),
-    "ego_from_origin": Range(
-        "re-centred", 0, 1000, np.max, "metres from the origin to an ego's first position"
-    ),
-    "leftovers": Range("masked", 0, 0, np.sum, "numbers other than 0 where an agent is not valid"),
-    "speed_ratio": Range("speed", 0.9, 1.1, np.median, "median of (distance covered / time) / speed"),
-    "speed_mismatch": Range(
-        "speed", 0, 0.2, np.mean, "share of spans whose velocity is not their positions'"
-    ),
-    "heading_mismatch": Range("heading", 0, 0.1, np.mean, "share of moving vehicles that point elsewhere"),
-    "vehicle_length": Range("size", 3, 9, np.median, "median length of vehicles in m"),
-    "vehicle_width": Range("size", 1.2, 3, np.median, "median width of vehicles in m"),
-    "lane_gap": Range("successors", 0, 0.1, np.mean, "share of successors over 3 m from their lane's end"),
-    "neighbor_side": Range("neighbours", 0.9, 1, np.mean, "share of neighbours on the side named", True),
-    "neighbor_along": Range("neighbours", 0.95, 1, np.mean, "share of neighbours of like direction", True),
-    "lane_width": Range("lanes", 1, 8, np.median, "median width of lanes in m where known", True),
-    "speed_limit": Range("lanes", 2, 45, np.median, "median speed limit in m/s where known", True),
-    "off_lane": Range("lanes", 0, 0.5, np.mean, "share of moving vehicles on no lane that runs their way"),
-    "off_road": Range("boundary", 0, 0.2, np.mean, "share of moving vehicles on the side not drivable"),
+RANGES: dict[str, tuple[str, float, float, Any, str]] = {
+    "dt": ("time step", 0.01, 1.0, np.median, "median time step in s"),
+    "ego_from_origin": ("re-centred", 0, 1000, np.max, "metres from the origin to an ego's first position"),
+    "leftovers": ("masked", 0, 0, np.sum, "numbers other than 0 where an agent is not valid"),
+    "speed_ratio": ("speed", 0.9, 1.1, np.median, "median of (distance covered / time) / speed"),
+    "speed_mismatch": ("speed", 0, 0.2, np.mean, "share of spans whose velocity is not their positions'"),
+    "heading_mismatch": ("heading", 0, 0.1, np.mean, "share of moving vehicles that point elsewhere"),
+    "vehicle_length": ("size", 3, 9, np.median, "median length of vehicles in m"),
+    "vehicle_width": ("size", 1.2, 3, np.median, "median width of vehicles in m"),
+    "lane_gap": ("successors", 0, 0.1, np.mean, "share of successors over 3 m from their lane's end"),
+    "neighbor_side": ("neighbours", 0.9, 1, np.mean, "share of neighbours on the side named"),
+    "neighbor_along": ("neighbours", 0.95, 1, np.mean, "share of neighbours of like direction"),
+    "lane_width": ("lanes", 1, 8, np.median, "median width of lanes in m where known"),
+    "speed_limit": ("lanes", 2, 45, np.median, "median speed limit in m/s where known"),
+    "off_lane": ("lanes", 0, 0.5, np.mean, "share of moving vehicles on no lane that runs their way"),
+    "off_road": ("boundary", 0, 0.2, np.mean, "share of moving vehicles on the side not drivable"),
 }
-"""Every number that is taken of the segments together, and where it must lie."""
+"""What is taken of the segments together: its check, least and most, how values are pooled, and what it is."""
+OPTIONAL = ("neighbor_side", "neighbor_along", "lane_width", "speed_limit")
+"""Numbers for which a format may have nothing to take them from."""
 
 
 @dataclass
 class Conformance:
-    """What a check of a reader or of segments has found.
+    """What a check of a reader or of segments has found."""
 
-    Attributes:
-        segments: how many were checked.
-        skipped: records the reader gave an error for instead.
-        numbers: those of :data:`RANGES`; NaN where there is nothing to take one from.
-        failures: check -> what is wrong; empty if all is well.
-    """
-
-    segments: int = 0
-    skipped: list[DataError] = field(default_factory=list)
-    numbers: dict[str, float] = field(default_factory=dict)
-    failures: dict[str, list[str]] = field(default_factory=dict)
+    segments: int = 0  # how many were checked
+    skipped: list[DataError] = field(default_factory=list)  # what the reader gave for records instead
+    numbers: dict[str, float] = field(default_factory=dict)  # those of RANGES; NaN where there is none
+    failures: dict[str, list[str]] = field(default_factory=dict)  # check -> what is wrong
 
     def fail(self, check: str, message: str) -> None:
         """Note a failure."""
@@ -189,13 +162,12 @@ def _inspected(segments: Sequence[RunSegment], report: Conformance) -> Conforman
         if _hashes(segments) != _hashes(SegmentStore(Path(folder) / "store")):
             report.fail("store", "a segment comes back changed")
     parts: list[dict[str, Any]] = [{**_motion(s), **_graph(s), **_on_map(s)} for s in segments]
-    for name, limits in RANGES.items():
+    for name, (check, low, high, pool, says) in RANGES.items():
         values = np.concatenate([np.atleast_1d(part[name]) for part in parts])
-        value = report.numbers[name] = float(limits.pool(values)) if len(values) else np.nan
+        value = report.numbers[name] = float(pool(values)) if len(values) else np.nan
         # NaN is no value inside: a check that had nothing to look at has not been passed.
-        if not (limits.low <= value <= limits.high or (np.isnan(value) and limits.optional)):
-            message = f"{name} ({limits.says}) is {value:.4g}, expected {limits.low:g} to {limits.high:g}"
-            report.fail(limits.check, message)
+        if not (low <= value <= high or (np.isnan(value) and name in OPTIONAL)):
+            report.fail(check, f"{name} ({says}) is {value:.4g}, expected {low:g} to {high:g}")
     return report
 
 
@@ -254,19 +226,13 @@ def _graph(s: RunSegment) -> dict[str, Any]:
 
 
 def _beside(lanes: Polylines, lane: int, other: int, sign: float) -> tuple[bool, bool]:
-    """Whether the other lane is on that side and runs the same way, at the middle of the shorter of the two."""
-    mine, theirs = (shapely.LineString(lanes[k][:, :2].astype(np.float64)) for k in (lane, other))
-    spot = min(mine, theirs, key=lambda line: line.length).interpolate(0.5, normalized=True)
-    (here, along), (there, onward) = (_foot(line, spot) for line in (mine, theirs))
-    across = there - here
+    """Whether the other lane is on that side of the middle of the one, and runs the same way there."""
+    mine, theirs = (lanes[k][:, :2].astype(np.float64) for k in (lane, other))
+    middle = len(mine) // 2
+    nearest = int(np.hypot(*(theirs - mine[middle]).T).argmin())
+    along, onward = np.gradient(mine, axis=0)[middle], np.gradient(theirs, axis=0)[nearest]
+    across = theirs[nearest] - mine[middle]
     return bool(sign * (along[0] * across[1] - along[1] * across[0]) > 0), bool(along @ onward > 0)
-
-
-def _foot(line: shapely.LineString, spot: shapely.Point) -> tuple[Doubles, Doubles]:
-    """(nearest point [2], step of the line around it [2])."""
-    at = line.project(spot)
-    here, before, after = (np.array(line.interpolate(max(at + step, 0)).coords[0]) for step in (0, -0.5, 0.5))
-    return here, after - before
 
 
 def _on_map(s: RunSegment) -> dict[str, Any]:

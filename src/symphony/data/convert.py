@@ -35,9 +35,7 @@ from symphony.files import write_json
 from symphony.parallel import Engine, ordered_map
 
 JOB, STORE, PARTS, STALE = "job.json", "store", "parts", "stale"
-REASONS_SHOWN = 5
-"""Reasons an error lists when nothing could be converted."""
-
+REASONS_SHOWN = 5  # by an error when nothing could be converted
 Progress = Callable[[int, int, Report], None]
 """Called with the files done, the files in all, and the report so far, after each record and file."""
 
@@ -163,17 +161,11 @@ def _reader(reader: str | Reader, options: Mapping[str, Any] | None) -> tuple[Re
 
 @dataclass(frozen=True)
 class Job:
-    """What a conversion does.
+    """What a conversion does."""
 
-    Attributes:
-        settings: arguments that its results depend on.
-        files: path and bytes of every file, in order.
-        changed: when each file, and each that is read together with one, was last changed (nanoseconds).
-    """
-
-    settings: dict[str, Any]
-    files: list[list[Any]]
-    changed: dict[str, int]
+    settings: dict[str, Any]  # arguments that its results depend on
+    files: list[list[Any]]  # path and bytes of every file, in order
+    changed: dict[str, int]  # when each, and each that is read with one, was last changed (nanoseconds)
 
     def check_same(self, begun: Job, folder: Path) -> None:
         """Refuse to go on with a conversion that was begun otherwise; names the first thing that differs."""
@@ -295,11 +287,7 @@ def _remove(folder: Path) -> None:
 
 
 def expand(files: Iterable[str | Path], patterns: tuple[str, ...]) -> list[Path]:
-    """Return files as named, and for a directory all files inside whose names fit one of the patterns, sorted.
-
-    Raises:
-        DataError: a path that does not exist, a directory without such files, or no paths at all.
-    """
+    """Return files as named, and for a directory all files inside whose names fit one of the patterns, sorted."""
     found: list[Path] = []
     for path in map(Path, files):
         if not path.exists():
@@ -319,13 +307,7 @@ def expand(files: Iterable[str | Path], patterns: tuple[str, ...]) -> list[Path]
 
 
 def info(path: str | Path) -> dict[str, Any]:
-    """Return what a store holds, as JSON can hold it.
-
-    Besides :meth:`SegmentStore.summary` and the fields of :class:`~symphony.data.report.Report`: ``checksum``,
-    ``skipped`` (how many; ``skipped_details`` says which), ``groups`` (recordings the segments are of) and
-    ``unfinished_generation`` (None, or how many segments are there, of how many). A :class:`DataError` says if it is
-    no store, or a damaged one.
-    """
+    """Return what a store holds, as JSON can hold it: its :meth:`SegmentStore.summary`, and much of its report."""
     store = SegmentStore(path)
     report = Report.from_json(store.report)
     kept = ("files", "settings", "exclusions", "reasons", "problems", "odd", "odd_examples", "overlaps")

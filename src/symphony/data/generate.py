@@ -143,9 +143,7 @@ PRESETS: dict[str, Preset] = {
 
 PER_NETWORK = 8  # segments taken from one network
 RECORDED = 90.0  # simulated seconds per network, for segments of 10 s
-STRAIGHT = (
-    5.0  # how many times likelier routes go straight on than they take one of the turns, as people's do
-)
+STRAIGHT = 5.0  # how many times likelier routes go straight on than they take one of the turns
 TURN_INTEREST = 0.2  # what a turn adds to a vehicle's chance of being the ego (see ``CropRule``)
 BARREN = 50  # networks in a row that may give nothing before the plan is given up
 
@@ -197,23 +195,14 @@ def _spread(segments: list[RunSegment], count: int, rng: np.random.Generator) ->
 
 @dataclass
 class Generation:
-    """How far a plan is, as kept in its store's report.
+    """How far a plan is, as kept in its store's report."""
 
-    Attributes:
-        networks: simulated, all their segments written.
-        accepted: segments they gave, of which some were taken.
-        reasons: how many windows gave none, and why.
-        failed: networks that gave nothing, and why.
-        seconds: of one core spent on networks.
-        complete: all segments are there.
-    """
-
-    networks: int = 0
-    accepted: int = 0
-    reasons: dict[str, int] = field(default_factory=dict)
-    failed: dict[str, str] = field(default_factory=dict)
-    seconds: float = 0.0
-    complete: bool = False
+    networks: int = 0  # simulated, all their segments written
+    accepted: int = 0  # segments they gave, of which some were taken
+    reasons: dict[str, int] = field(default_factory=dict)  # how many windows gave none, and why
+    failed: dict[str, str] = field(default_factory=dict)  # networks that gave nothing, and why
+    seconds: float = 0.0  # of one core spent on networks
+    complete: bool = False  # all segments are there
 
     def add(self, found: Harvest, complete: bool) -> None:
         """Count one more network, and note whether it was the last."""

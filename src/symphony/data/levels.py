@@ -16,31 +16,20 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import Polylines, RunSegment
 
-LEVEL = (
-    2.5  # metres of height, at one place, from which on two things are on different levels (as in geometry)
-)
+LEVEL = 2.5  # metres of height from which on two things at one place are on different levels
 CELL = 5.0  # metres of the columns in which heights are compared
 RISE = 1.5  # metres by which a surface may rise from one column to a neighbour, two columns away at most
 SPACING = 2.0  # metres between the points at which the lines of a map are looked at, at most
-NOWHERE = (
-    99  # number of what is a level away from every line at its place: a car on a bridge that the map lacks
-)
+NOWHERE = 99  # number of what is a level away from all lines at its place, as on a bridge the map lacks
 
 _NEAR = sorted(
-    ((x, y) for x in range(-2, 3) for y in range(-2, 3)), key=lambda step: step[0] ** 2 + step[1] ** 2
+    ((x, y) for x in range(-2, 3) for y in range(-2, 3)), key=lambda way: way[0] ** 2 + way[1] ** 2
 )
 _WIDE = 1 << 20
 
 
 class Levels:
-    """The levels of a map.
-
-    Args:
-        points: [P, 3] on its lines, close to each other.
-
-    Attributes:
-        flat: whether it has none.
-    """
+    """The levels of a map, from points [P, 3] on its lines, close to each other; ``flat`` if it has none."""
 
     def __init__(self, points: NDArray[np.floating[Any]]) -> None:
         self.flat = True
@@ -121,9 +110,7 @@ def levels_of(segment: RunSegment) -> Levels:
 
 def ground(segment: RunSegment) -> NDArray[np.float32]:
     """[A, T, 3] the place below each agent, whose logged one is the middle of its box."""
-    down = np.zeros((segment.num_agents, 1, 3), np.float32)
-    down[:, 0, 2] = segment.size[:, 2] / 2
-    return segment.position - down
+    return segment.position - (segment.size * np.array([0, 0, 0.5], np.float32))[:, None]
 
 
 def agent_heights(segment: RunSegment, levels: Levels | None = None) -> NDArray[np.float32]:

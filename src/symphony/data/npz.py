@@ -15,16 +15,14 @@ from numpy.typing import NDArray
 from symphony.errors import DataError
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-MOST = 1 << 29
-"""Bytes of the arrays of an archive, unless more are allowed."""
+MOST = 1 << 29  # bytes of the arrays of an archive, unless more are allowed
 
 
 def read_npz(path: Path, names: Collection[str] = (), *, most: int = MOST) -> dict[str, NDArray[Any]]:
     """The arrays of an archive by their names; nothing is unpickled.
 
-    How much memory they take is checked before any of it is asked for: what their headers claim must be what the
-    archive holds, and that at most ``most`` bytes in all, or a :class:`DataError` names file and field. With
-    ``names``, only these are read.
+    Before memory is asked for, their headers must claim what the archive holds, and that at most ``most`` bytes in
+    all, or a :class:`DataError` names file and field. With ``names``, only these are read.
     """
     found: dict[str, NDArray[Any]] = {}
     left, name = most, None

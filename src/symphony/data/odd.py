@@ -1,36 +1,25 @@
-"""What is odd in a record is left out, and noted by kind with an example; the rest of the record goes on."""
+"""A run segment without some of its agents, states, steps or lines: odd ones, which are noted, or far ones."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
-from symphony.data.segment import (
-    MAX_COORDINATE,
-    MAX_HEADING,
-    MAX_HEIGHT,
-    MAX_JUMP,
-    MAX_SIZE,
-    MAX_SPEED,
-    MIN_SIZE,
-    STATES,
-    Bools,
-    Polylines,
-    RunSegment,
-    jumps,
-    largest,
-)
-from symphony.data.subset import lines_of, with_agents, with_lanes
+from symphony.data import segment as schema
+from symphony.data.segment import STATES, Bools, Polylines, RunSegment, jumps, largest, validate
 
-LATE = 1.0
-"""Seconds after the first step of a log within which an ego may come: then the segment begins there."""
+LATE = 1.0  # seconds after the first step within which an ego may come: then the segment begins there
+PLACE = schema.MAX_COORDINATE, schema.MAX_COORDINATE, schema.MAX_HEIGHT
+MARGIN = 10.0  # metres beside the lanes that are kept within which the boundary is kept, too
 
 NO_SIZE = "an agent left out: a box without a size"
-THIN = f"a box with a side under {100 * MIN_SIZE:g} cm made that wide"
+THIN = f"a box with a side under {100 * schema.MIN_SIZE:g} cm made that wide"
 WILD = "states left out: not finite, or beyond what is plausible"
 UNSEEN = "an agent left out: no plausible state"
 NO_LINE = "a line of the map left out: not finite, or beyond what is plausible"
@@ -88,18 +77,17 @@ def _lines(segment: RunSegment) -> RunSegment:
 
 def _plausible(lines: Polylines) -> Bools:
     """[K] whether all points of a line are."""
-    limits = MAX_COORDINATE, MAX_COORDINATE, MAX_HEIGHT
-    bad = ~(np.abs(lines.points) <= limits).all(axis=1)
+    bad = ~(np.abs(lines.points) <= PLACE).all(axis=1)
     return np.bincount(lines.line_index[bad], minlength=len(lines)) == 0
 
 
 def _states(segment: RunSegment) -> RunSegment:
     s = segment
     numbers = np.concatenate([s.position, s.velocity, s.heading[..., None]], axis=-1)
-    limits = MAX_COORDINATE, MAX_COORDINATE, MAX_HEIGHT, MAX_SPEED, MAX_SPEED, MAX_HEADING
+    limits = (*PLACE, schema.MAX_SPEED, schema.MAX_SPEED, schema.MAX_HEADING)
     valid = s.valid & (np.abs(numbers) <= limits).all(axis=-1)
     place = np.where(valid[..., None], s.position[..., :2].astype(np.float64), 0.0)
-    far = np.hypot(*np.moveaxis(np.diff(place, axis=1), -1, 0)) > MAX_JUMP
+    far = np.hypot(*np.moveaxis(np.diff(place, axis=1), -1, 0)) > schema.MAX_JUMP
     for agent in np.flatnonzero((far & valid[:, 1:] & valid[:, :-1]).any(axis=1)):
         valid[agent] = _without_jumps(place[agent], valid[agent])
     if (valid == s.valid).all():
@@ -114,25 +102,25 @@ def _states(segment: RunSegment) -> RunSegment:
 def _without_jumps(place: NDArray[np.float64], valid: Bools) -> Bools:
     """[T] the valid steps of a track [T, 2] that are no jump away from its longest piece without one."""
     steps = np.flatnonzero(valid)
-    piece = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(place[steps], axis=0).T) > MAX_JUMP)])
+    piece = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(place[steps], axis=0).T) > schema.MAX_JUMP)])
     longest = steps[piece == np.bincount(piece).argmax()]
     nearest = np.clip(np.arange(len(valid)), longest[0], longest[-1])
-    return valid & (np.hypot(*(place - place[nearest]).T) <= MAX_JUMP)
+    return valid & (np.hypot(*(place - place[nearest]).T) <= schema.MAX_JUMP)
 
 
 def _agents(segment: RunSegment) -> RunSegment:
     s = segment
     size, found = s.size.copy(), dict[str, str]()
-    unknown = ~((size[:, 2] >= 0) & (size[:, 2] < MAX_SIZE))
+    unknown = ~((size[:, 2] >= 0) & (size[:, 2] < schema.MAX_SIZE))
     size[unknown, 2] = 0  # a height that is not known is none
-    thin = (size[:, :2] > 0) & (size[:, :2] < MIN_SIZE)
-    sized = ((size[:, :2] > 0) & (size[:, :2] < MAX_SIZE)).all(axis=1)
+    thin = (size[:, :2] > 0) & (size[:, :2] < schema.MIN_SIZE)
+    sized = ((size[:, :2] > 0) & (size[:, :2] < schema.MAX_SIZE)).all(axis=1)
     kinds: dict[str, Any] = {NO_SIZE: ~sized, UNSEEN: ~s.valid.any(axis=1), THIN: thin.any(axis=1)}
     for kind, which in kinds.items():
         which[s.ego] &= kind == THIN
         if which.any():
             found[kind] = f"agent {s.agent_id[np.argmax(which)]}"
-    size[:, :2][thin] = MIN_SIZE
+    size[:, :2][thin] = schema.MIN_SIZE
     left = kinds[NO_SIZE] | kinds[UNSEEN]
     return noted(with_agents(s.replace(size=size), ~left), found)
 
@@ -146,3 +134,79 @@ def from_ego(segment: RunSegment) -> RunSegment:
     timed = {name: getattr(segment, name)[:, first:].copy() for name in (*STATES, "signal_state")}
     later = segment.replace(current_step=max(segment.current_step - first, 0), **timed)
     return noted(with_agents(later, there), {LATE_EGO: f"{first} of {segment.num_steps}"})
+
+
+def with_agents(segment: RunSegment, kept: Bools) -> RunSegment:
+    """The agents that a mask [A] keeps, the ego among them, everything that refers to them renumbered."""
+    return segment.replace(
+        ego=int(kept[: segment.ego].sum()),
+        **{name: getattr(segment, name)[kept] for name in ("agent_id", "agent_type", "size", *STATES)},
+        interest=_renumbered(segment.interest[kept[segment.interest]], kept),
+        predict=_renumbered(segment.predict[kept[segment.predict]], kept),
+    )
+
+
+def with_lanes(segment: RunSegment, kept: Bools) -> RunSegment:
+    """The lanes that a mask [L] keeps, with the links between them and their lights."""
+    road, lights = segment.road, kept[segment.signal_lane]
+    pairs = {name: getattr(road, name) for name in ("successors", "left_neighbors", "right_neighbors")}
+    names = ("lane_id", "lane_type", "speed_limit", "lane_width")
+    fields: dict[str, Any] = {name: getattr(road, name)[kept] for name in names}
+    fields |= {name: _renumbered(pair[kept[pair].all(axis=1)], kept) for name, pair in pairs.items()}
+    return segment.replace(
+        road=dataclasses.replace(road, lanes=lines_of(road.lanes, kept), **fields),
+        signal_lane=_renumbered(segment.signal_lane[lights], kept),
+        signal_point=segment.signal_point[lights],
+        signal_state=segment.signal_state[lights],
+    )
+
+
+def lines_of(lines: Polylines, kept: Bools) -> Polylines:
+    """The lines that a mask [K] keeps."""
+    return Polylines.of([lines[k] for k in np.flatnonzero(kept).tolist()])
+
+
+def _renumbered(index: NDArray[Any], kept: Bools) -> NDArray[np.int32]:
+    return (np.cumsum(kept) - 1).astype(np.int32)[index]
+
+
+def crop(segment: RunSegment, radius: float) -> RunSegment:
+    """Keep what comes within a radius in metres of the ego's logged path: some sources give a whole district.
+
+    Lanes are kept whole, with their links and lights, and so are agents that are near enough at some step; of the
+    boundary and the marks the pieces that are near enough, or beside a lane that is kept.
+    """
+    road = segment.road
+    near = _shape(segment.position[segment.ego, segment.valid[segment.ego]]).buffer(radius)
+    shapely.prepare(near)
+    spots = segment.position[..., :2].astype(np.float64)
+    agents = (shapely.contains_xy(near, spots[..., 0], spots[..., 1]) & segment.valid).any(axis=1)
+    agents[segment.ego] = True
+    shapes = [_shape(road.lanes[k]) for k in range(len(road.lanes))]
+    kept = shapely.intersects(near, np.array(shapes, object))
+    lanes = [shape.buffer(MARGIN) for shape, keep in zip(shapes, kept, strict=True) if keep]
+    beside = shapely.union_all([near, *lanes])
+    shapely.prepare(beside)
+    edges, marks = ([_pieces(ls[k], beside) for k in range(len(ls))] for ls in (road.boundary, road.marks))
+    road = dataclasses.replace(
+        road,
+        boundary=Polylines.of([piece for pieces in edges for piece in pieces]),
+        marks=Polylines.of([piece for pieces in marks for piece in pieces]),
+        mark_type=np.repeat(road.mark_type, [len(pieces) for pieces in marks]),
+    )
+    return validate(with_agents(with_lanes(segment.replace(road=road), kept), agents))
+
+
+def _shape(points: NDArray[Any]) -> Any:
+    flat = points[:, :2].astype(np.float64)
+    return shapely.LineString(flat) if len(flat) > 1 else shapely.Point(flat[0])
+
+
+def _pieces(line: NDArray[np.float32], area: Any) -> list[NDArray[np.float32]]:
+    """Stretches of a line [P, 3] of edges that touch an area, each uncut, in their order."""
+    points = line[:, :2].astype(np.float64)
+    if len(line) == 1:
+        return [line] if shapely.intersects_xy(area, *points[0]) else []
+    keep = shapely.intersects(area, shapely.linestrings(np.stack([points[:-1], points[1:]], axis=1)))
+    change = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(np.int8)))
+    return [line[a : b + 1] for a, b in pairwise(change.tolist()) if keep[a]]

@@ -15,14 +15,13 @@ from typing import Any
 
 from symphony.data import joins, overlaps
 from symphony.data import resample as resampling
-from symphony.data.odd import from_ego, oddities
+from symphony.data.odd import crop, from_ego, oddities
 from symphony.data.report import Skip
 from symphony.data.segment import RunSegment
 from symphony.data.selection import exclusion
 from symphony.data.sources import Reader
 from symphony.data.sources.base import unexpected
 from symphony.data.store_writer import StoreWriter
-from symphony.data.subset import crop
 from symphony.errors import ConfigError, DataError
 
 PART_BYTES, PART_FILES = 8 << 20, 64  # small files go together: a part is some 60 files to write and delete

@@ -52,27 +52,16 @@ class Skip:
 
 @dataclass
 class Report:
-    """What a conversion did.
+    """What a conversion did."""
 
-    Attributes:
-        converted: segments added.
-        files: files read.
-        skipped: what was left out, the paper's exclusions included.
-        settings: arguments of the conversion.
-        odd: what is unusual or was left out, and about how many of the segments added.
-        overlaps: segments added in whose log a moving vehicle's box overlaps another.
-        joined_gaps: links between lanes that were added, summed over the segments.
-        odd_examples: the first of each kind of ``odd``.
-    """
-
-    converted: int = 0
-    files: int = 0
-    skipped: list[Skip] = field(default_factory=list)
-    settings: dict[str, Any] = field(default_factory=dict)
-    odd: dict[str, int] = field(default_factory=dict)
-    overlaps: int = 0
-    joined_gaps: int = 0
-    odd_examples: dict[str, str] = field(default_factory=dict)
+    converted: int = 0  # segments added
+    files: int = 0  # files read
+    skipped: list[Skip] = field(default_factory=list)  # what was left out, the paper's exclusions included
+    settings: dict[str, Any] = field(default_factory=dict)  # arguments of the conversion
+    odd: dict[str, int] = field(default_factory=dict)  # what is unusual or was left out, of how many segments
+    overlaps: int = 0  # segments added in whose log a moving vehicle's box overlaps another
+    joined_gaps: int = 0  # links between lanes that were added, summed over the segments
+    odd_examples: dict[str, str] = field(default_factory=dict)  # the first of each kind of odd
 
     def note(self, odd: Mapping[str, str], segment: str) -> None:
         """Count what is odd about a segment: kind -> example."""

@@ -160,8 +160,7 @@ def smooth(segment: RunSegment, sigma: float) -> RunSegment:
     positions with Gaussian weights in time (standard deviation ``sigma`` seconds), out to 4 sigma. Inside a track it
     is a Gaussian filter; unlike one it does not pull a moving agent inwards at the ends of its track or beside gaps.
     Above 2 m/s the heading becomes the direction of motion (or its opposite, for an agent that reverses), below 1 m/s
-    it is the logged one, smoothed, and in between it goes over from one to the other. A track of a single valid step
-    stays as it is.
+    it is the logged one, smoothed, in between something between. A track of one valid step stays as it is.
     """
     if not 0 < sigma <= MAX_SIGMA:
         raise ConfigError(f"sigma must be positive and at most {MAX_SIGMA:g} s, is {sigma}")

@@ -58,10 +58,8 @@ def check_signals(lights: int, steps: int, field: str) -> None:
 Floats = NDArray[np.float32]
 Ints = NDArray[np.integer[Any]]
 Bools = NDArray[np.bool_]
-Check = tuple[str, bool, str]
-"""Field, whether it holds, and what is wrong if it doesn't."""
-STATES = ("position", "heading", "velocity", "valid")
-"""Fields with a row for each agent and a column for each step."""
+Check = tuple[str, bool, str]  # field, whether it holds, and what is wrong if it doesn't
+STATES = ("position", "heading", "velocity", "valid")  # a row for each agent, a column for each step
 
 
 class AgentType(IntEnum):

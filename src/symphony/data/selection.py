@@ -16,22 +16,18 @@ from symphony.errors import DataError
 Reals = NDArray[np.floating[Any]]
 Rows = NDArray[np.integer[Any]]
 
-HALF_LANE, APART = 1.5, 2.5
-"""Metres sideways within which two paths are one, and from which on they are in different lanes before that."""
-SAME_WAY = np.deg2rad(30)
-"""Heading difference below which two vehicles at the same place go the same way; up to 150 degrees they cross."""
-SHARED, LOOKBACK = 5.0, 50.0
-"""Metres of path two vehicles must have in common, and before the place where two become one that are compared."""
-TIME_GAP = 3.0
-"""Seconds between two vehicles at the same place within which one follows the other."""
+HALF_LANE, APART = 1.5, 2.5  # metres aside within which paths are one, and from which on lanes are different
+SAME_WAY = np.deg2rad(
+    30
+)  # turn below which two at the same place go the same way; up to 150 degrees they cross
+SHARED, LOOKBACK = 5.0, 50.0  # metres of path in common, and of those compared before two paths become one
+TIME_GAP = 3.0  # seconds between two vehicles at the same place within which one follows the other
 CONFLICT_GAP = 4.0
 """Seconds between two vehicles at the place where their paths cross or become one within which they interact.
 Between two customary limits: 3 s on the difference in time to the conflict point (INTERACTION data set, Zhan et al.,
 2019, arXiv:1910.03088) and 5 s on the post-encroachment time (SSAM, FHWA-HRT-08-051, 2008)."""
-QUEUE_SPEED, KEPT = 5.0, 1.0
-"""m/s at which ``TIME_GAP`` is the distance of slower vehicles, and seconds for which it must be kept in one lane."""
-TILE = 1_000_000
-"""Pairs of steps that are compared at a time."""
+QUEUE_SPEED, KEPT = 5.0, 1.0  # m/s at which TIME_GAP is the distance of slower ones; seconds it must be kept
+TILE = 1_000_000  # pairs of steps that are compared at a time
 
 
 class Context(StrEnum):
@@ -202,8 +198,7 @@ def _way_back(segment: RunSegment, agent: int, step: int) -> Reals:
     return np.stack([driven, *position.T, heading])
 
 
-MAX_PLAYBACK_AGENTS = 256
-MAX_ROAD_POINTS = 10_000
+MAX_PLAYBACK_AGENTS, MAX_ROAD_POINTS = 256, 10_000
 EXCLUSIONS = {
     "playback_agents": f"more than {MAX_PLAYBACK_AGENTS} playback agents",
     "roadgraph_points": f"more than {MAX_ROAD_POINTS} roadgraph points (convert --radius keeps fewer)",
@@ -342,10 +337,3 @@ def exclusion(segment: RunSegment, count: int) -> tuple[str, DataError] | None:
     except DataError as error:
         return "interactive_agents", error
     return None
-
-
-def usable(segment: RunSegment, count: int) -> None:
-    """Raise the :class:`DataError` of :func:`exclusion`, if there is one."""
-    found = exclusion(segment, count)
-    if found is not None:
-        raise found[1]

@@ -64,12 +64,12 @@ class SegmentStore(Sequence[RunSegment]):
         """Map what each column must hold. Return if one has more: a writer works or died, or the index is cut."""
         used, more = table.ends(records), False
         for column in table.columns:
-            path, rows = table.column_path(self.path, column), int(used[table.axes[column.axis]])
-            need = rows * column.row_bytes
+            path, rows = column.path(self.path), int(used[table.axes[column.axis]])
+            need = rows * column.row.itemsize
             size = path.stat().st_size if path.is_file() else -1
             if size < need:
                 raise DataError(f"column is truncated: {size} of {need} bytes", file=path, field=column.name)
-            self._columns[column.name] = _mapped(path, np.dtype((column.dtype, column.tail)), rows)
+            self._columns[column.name] = _mapped(path, column.row, rows)
             more |= size > need
         return more
 
@@ -153,11 +153,6 @@ class SegmentStore(Sequence[RunSegment]):
         return cast(str, self._segments["hash"][self._row(index)].tobytes().hex())
 
     @property
-    def num_maps(self) -> int:
-        """Number of distinct maps."""
-        return len(self._maps)
-
-    @property
     def map_hashes(self) -> list[bytes]:
         """Hash of the content of each distinct map."""
         return [key.tobytes() for key in self._maps["hash"]]
@@ -233,15 +228,12 @@ class SegmentStore(Sequence[RunSegment]):
     @property
     def unfinished(self) -> str | None:
         """That its generation is still under way, or was interrupted: how many segments there are, of how many."""
-        made = self.report.get("generation")
-        if not isinstance(made, dict) or made.get("complete") is not False:
+        found = [self.report.get(name) for name in ("generation", "settings")]
+        made, settings = (each if isinstance(each, dict) else {} for each in found)
+        if made.get("complete") is not False:
             return None
-        settings = self.report.get("settings")
-        wanted = settings.get("segments", "more") if isinstance(settings, dict) else "more"
-        return (
-            f"holds {len(self)} of {wanted} segments: its generation is not finished; give the same "
-            "`symphony data generate` again"
-        )
+        held = f"holds {len(self)} of {settings.get('segments', 'more')} segments: its generation is not finished"
+        return f"{held}; give the same `symphony data generate` again"
 
     def check_complete(self) -> None:
         """Refuse a store that is still being generated, or whose generation was interrupted."""
@@ -251,20 +243,16 @@ class SegmentStore(Sequence[RunSegment]):
     def checksum(self) -> str:
         """Return SHA-256 over the hashes in the index, sorted by segment id: the same for the same segments.
 
-        A hash covers all of a segment that :class:`~symphony.data.segment.RunSegment` holds, its map included; not
-        its tags, the order of insertion or the report. That the content still has these hashes is seen when it is
-        read (or by :meth:`verify`).
+        A hash covers all of a segment and its map; not its tags, the order of insertion or the report. That the
+        content still has these hashes is seen when it is read (or by :meth:`verify`).
         """
-        digest = hashlib.sha256()
-        for i in sorted(range(len(self)), key=self.ids.__getitem__):
-            digest.update(self._segments["hash"][i].tobytes())
-        return digest.hexdigest()
+        order = sorted(range(len(self)), key=self.ids.__getitem__)
+        return hashlib.sha256(self._segments["hash"][order].tobytes()).hexdigest()
 
     def verify(self, progress: Callable[[int, int], None] | None = None) -> None:
-        """Read everything, read before or not, and compare it with the hashes and the schema; the tags must be JSON.
+        """Read everything, and compare it with the hashes and the schema; the tags must be JSON.
 
-        A :class:`DataError` names the first segment that is not what was written. ``progress`` is told how many are
-        done, of how many.
+        A :class:`DataError` names the first segment that is not what was written. ``progress`` hears done and total.
         """
         for number, key in enumerate(self.map_hashes):
             if content_hash(self.road(number)) != key.hex():

@@ -30,8 +30,7 @@ from symphony.files import Lock
 FORMAT = "symphony segment store"
 VERSION = 1
 HEADER, LOCK, REPORT, COLUMNS = "store.json", "store.lock", "report.json", "columns"
-PARTIAL = ".partial"
-"""What a store's name is followed by while a conversion into it is not finished."""
+PARTIAL = ".partial"  # what a store's name is followed by while a conversion into it is not finished
 
 
 class Column(NamedTuple):
@@ -43,20 +42,18 @@ class Column(NamedTuple):
     tail: tuple[int, ...] = ()
 
     @property
-    def row_bytes(self) -> int:
-        """Bytes of one row."""
-        return np.dtype((self.dtype, self.tail)).itemsize
+    def row(self) -> np.dtype[Any]:
+        """Type of one row."""
+        return np.dtype((self.dtype, self.tail))
+
+    def path(self, folder: Path) -> Path:
+        """Return where it lies in a store."""
+        return folder / COLUMNS / f"{self.name}.bin"
 
 
 @dataclass(frozen=True)
 class Table:
-    """Columns plus an index of fixed-size records.
-
-    Attributes:
-        name: stem of the index file.
-        columns: the array fields.
-        scalars: (name, dtype, shape) of what a record holds besides the extents and the content hash.
-    """
+    """Columns, and an index of fixed-size records: extents, content hash and scalars (name, dtype, shape)."""
 
     name: str
     columns: tuple[Column, ...]
@@ -76,12 +73,8 @@ class Table:
         )
 
     def index_path(self, folder: Path) -> Path:
-        """Where the index lies."""
+        """Return where the index lies."""
         return folder / f"{self.name}.idx"
-
-    def column_path(self, folder: Path, column: Column) -> Path:
-        """Where a column lies."""
-        return folder / COLUMNS / f"{column.name}.bin"
 
     def ends(self, records: NDArray[Any]) -> NDArray[np.int64]:
         """[axes] rows in use on each axis."""

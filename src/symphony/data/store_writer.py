@@ -24,14 +24,9 @@ from symphony.files import Lock, naming, write_json
 class StoreWriter:
     """Adds segments to a store, one at a time; each is on record once :meth:`append` returns.
 
-    Opening for append cuts off what a writer that died left unfinished. Only one writer at a time.
-
-    Args:
-        path: the store's directory; created, or must be empty unless ``append``.
-        append: continue an existing store (or start one).
-
-    Raises:
-        DataError: the directory holds something else, is damaged, of another version, or being written.
+    Its folder is created, or must be empty unless an existing store is continued (``append``): then what a writer
+    that died left unfinished is cut off. A :class:`DataError` says if the folder holds something else, is damaged, of
+    another version, or being written: there is one writer at a time.
     """
 
     def __init__(self, path: str | Path, *, append: bool = False) -> None:
@@ -67,15 +62,10 @@ class StoreWriter:
         return self._ids[segment_id]
 
     def append(self, segment: RunSegment, *, tags: Mapping[str, Any] | None = None) -> int:
-        """Add one segment and return its index.
+        """Add one segment and return its index; a :class:`DataError` if it breaks the schema or its name is taken.
 
-        Args:
-            segment: validated here.
-            tags: anything JSON can hold, given back by :meth:`SegmentStore.tags`; not under the name
-                ``group``, where the segment's group is kept.
-
-        Raises:
-            DataError: the segment breaks the schema, or one of that name is there already.
+        Tags are anything JSON can hold, given back by :meth:`SegmentStore.tags`; not under the name ``group``, where
+        the segment's group is kept.
         """
         segment = _plain(validate(segment))
         if tags and GROUP in tags:
@@ -159,9 +149,7 @@ class _TableWriter:
         self.table = table
         self.state = (len(records), table.ends(records))
         self._index: BinaryIO = table.index_path(folder).open("r+b", buffering=0)
-        self._files: dict[str, BinaryIO] = {
-            c.name: table.column_path(folder, c).open("r+b", buffering=0) for c in table.columns
-        }
+        self._files = {c.name: c.path(folder).open("r+b", buffering=0) for c in table.columns}
         self._trim()
 
     def append(self, values: Mapping[str, NDArray[Any]], digest: bytes, scalars: Mapping[str, Any]) -> int:
@@ -169,10 +157,10 @@ class _TableWriter:
         record = np.zeros(1, self.table.record)
         counts = np.zeros(len(self.table.axes), np.int64)
         for column in self.table.columns:
-            counts[self.table.axes[column.axis]] = values[column.name].nbytes // column.row_bytes
+            counts[self.table.axes[column.axis]] = values[column.name].nbytes // column.row.itemsize
         number, end = self.state
         for column in self.table.columns:
-            begin = int(end[self.table.axes[column.axis]]) * column.row_bytes
+            begin = int(end[self.table.axes[column.axis]]) * column.row.itemsize
             _write_at(self._files[column.name], begin, values[column.name])
         record["begin"], record["count"] = end, counts
         record["hash"] = np.frombuffer(digest, np.uint8)
@@ -188,7 +176,7 @@ class _TableWriter:
         number, end = self.state
         self._index.truncate(number * self.table.record.itemsize)
         for column in self.table.columns:
-            self._files[column.name].truncate(int(end[self.table.axes[column.axis]]) * column.row_bytes)
+            self._files[column.name].truncate(int(end[self.table.axes[column.axis]]) * column.row.itemsize)
 
     def close(self) -> None:
         """Bring everything to the disk, columns before the index, and write no more."""
@@ -232,6 +220,6 @@ def _create(path: Path) -> None:
     """Empty files first and the header last: with a header, a store is whole."""
     (path / layout.COLUMNS).mkdir(exist_ok=True)
     for table in layout.TABLES:
-        for file in (table.index_path(path), *(table.column_path(path, c) for c in table.columns)):
+        for file in (table.index_path(path), *(c.path(path) for c in table.columns)):
             file.touch()
     write_json(path / layout.HEADER, layout.header())

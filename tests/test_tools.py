@@ -1,17 +1,20 @@
-"""A small part of `make fuzz` (see tests/tools/fuzz.py), and that it notices what it is for."""
+"""The harnesses of `make fuzz` and `make kills` notice what they are for; skipped tests are counted."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
+import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from helpers_segments import straight_road
+from helpers_skips import by_kind, grown
 from symphony.data.sources import readers
 
 pytestmark = pytest.mark.skipif(
@@ -19,10 +22,14 @@ pytestmark = pytest.mark.skipif(
 )
 if sys.platform.startswith("linux"):
     import fuzz
+    import kills
     from fuzz import BAD, Counts, attempt, inputs, run
     from fuzz_mutations import Target
     from fuzz_targets import TARGETS, absurd
+    from kills import torment
+    from kills_targets import files
 
+HERE = Path(__file__).parent
 INPUTS = 8
 NAMES = [*readers(), "test_area", "store", "checkpoint", "configuration", "submission", "rollouts"]
 
@@ -90,3 +97,62 @@ def test_absurd_segments_are_known() -> None:
     good = straight_road()
     assert absurd(good) == ""
     assert "speed" in absurd(good.replace(velocity=good.velocity * np.float32(1e6)))
+
+
+def count(out: Path, careful: bool) -> None:
+    """Count to five in files that are whole or not there, or begin anew whatever there is."""
+    out.mkdir(exist_ok=True)
+    for k in range(len(list(out.glob("[0-9].json"))) if careful else 0, 5):
+        sum(range(1_000_000))
+        (out / "draft").write_text(f'{{"k": {k}, "seconds": {id(out)}}}')
+        (out / "draft").replace(out / f"{k}.json")
+        if not careful:
+            with (out / "all").open("a") as file:
+                file.write(str(k))
+
+
+def careful(out: Path) -> None:
+    count(out, True)
+
+
+def careless(out: Path) -> None:
+    count(out, False)
+
+
+@pytest.mark.parametrize(("work", "good"), [(careful, True), (careless, False)])
+def test_what_is_lost_or_comes_twice_is_found(
+    work: Callable[[Path], None], good: bool, tmp_path: Path
+) -> None:
+    counts = torment(kills.Target(work, files), tmp_path, 6, seed=0)
+    assert counts.kills >= 6
+    assert counts.finished >= 1
+    assert (counts.failed == []) == good
+
+
+def test_work_that_fails_is_told(tmp_path: Path) -> None:
+    def fail(out: Path) -> None:
+        raise ZeroDivisionError
+
+    assert torment(kills.Target(fail, files), tmp_path, 1, seed=0).failed == ["undisturbed: status 1"]
+
+
+def test_more_than_are_written_down_are_told() -> None:
+    counts = by_kind(["Skipped: no CUDA device"] * 3 + ["Skipped: lazy"])
+    assert counts == {"a card": 3, "Skipped: lazy": 1}
+    assert grown(counts, "3 a card\n1 Skipped: lazy\n") == []
+    told = grown(counts, "2 a card\n")
+    assert [line.partition(", ")[0] for line in told] == [
+        "3 tests skipped for want of a card",
+        "1 tests skipped for want of Skipped: lazy",
+    ]
+
+
+@pytest.mark.parametrize(("watched", "status"), [("", 0), ("1", 1)])
+def test_an_unknown_skip_fails_where_it_is_watched(tmp_path: Path, watched: str, status: int) -> None:
+    (tmp_path / "conftest.py").write_text((HERE / "conftest.py").read_text())
+    (tmp_path / "test_it.py").write_text("import pytest\n\ndef test_it():\n    pytest.skip('lazy')\n")
+    command = [sys.executable, "-m", "pytest", "-q", "-c", os.devnull, str(tmp_path)]
+    env = os.environ | {"SYMPHONY_SKIPS": watched, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path])}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=env)
+    assert done.returncode == status, done.stdout + done.stderr
+    assert "1 Skipped: lazy" in done.stdout
