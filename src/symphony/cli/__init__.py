@@ -97,8 +97,8 @@ def main(args: Sequence[str] | None = None) -> int:
             config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
         )
         for name, value, bounds in _marked(chosen, Bounds):
-            if not bounds.least <= (len(value) if isinstance(value, tuple) else value) <= bounds.most:
-                raise ConfigError(f"{name}: give at least {bounds.least:g} and at most {bounds.most:g}")
+            if (len(value) if isinstance(value, tuple) else value) < bounds.least:
+                raise ConfigError(f"--{name.replace('_', '-')}: give at least {bounds.least}")
     except ConfigError as error:
         return _complain(error, USAGE)
     except SystemExit as stop:

@@ -70,9 +70,8 @@ class Generate(shared.Command):
 
         expected: dict[Any, str] = {} if self.preset is None else dict(PRESETS[self.preset].checksums)
         found = [self._make(*made, expected.get(made[0])) for made in self._plans()]
-        if shared.write_numbers(
-            self.json, {"preset": self.preset, "stores": {one["split"]: one for one in found}}
-        ):
+        stores = {one["split"]: one for one in found}
+        if shared.write_numbers(self.json, {"preset": self.preset, "stores": stores}):
             for one in found:
                 shared.print_facts(one)
         for one in found:
@@ -90,12 +89,9 @@ class Generate(shared.Command):
 
             made = generate(plan, path, workers=self.workers, engine=self.engine, progress=show)
         store = symphony.SegmentStore(path)
-        about = {"split": split, "path": str(path), "segments": len(store), "checksum": store.checksum()}
-        return about | {
-            "expected_checksum": expected,
-            "settings": store.report["settings"],
-            "generation": asdict(made),
-        }
+        found = {"split": split, "path": str(path), "segments": len(store), "checksum": store.checksum()}
+        found |= {"expected_checksum": expected, "settings": store.report["settings"]}
+        return found | {"generation": asdict(made)}
 
 
 class Quality(shared.Command):
@@ -169,19 +165,15 @@ class Convert(shared.Command):
     window: float = 10.0  # Seconds of the run segments that recordings of INTERACTION are cut into.
     #: Seconds between the starts of two windows of INTERACTION; without it, one begins where another ends.
     stride: float | None = None
-    #: Source of velocities and headings of INTERACTION: as logged, or the positions (for files that are refused
-    #: because theirs don't fit).
+    #: Source of velocities and headings of INTERACTION: as logged, or the positions, where the logged ones don't fit.
     motion: Literal["logged", "positions"] = "logged"
-    #: Metres from the ego's path within which map and agents are kept: for sources that give whole districts, whose
-    #: maps would exceed the paper's limit (ScenarioNet).
+    #: Metres from the ego's path within which map and agents are kept: for sources of whole districts (ScenarioNet).
     radius: float | None = None
     #: Leave out run segments in whose log a moving vehicle's box overlaps another box.
     exclude_overlaps: bool = False
-    #: Give lights the last state that the log knows (before the first: the first) where it knows none, instead
-    #: of `unknown`: for logs that show their lights at a single step (see docs/formats.md).
+    #: Give lights their last known state (before it: the first) where the log knows none (see docs/formats.md).
     hold_lights: bool = False
-    #: Skip a record of which something odd would be left out (an agent without a size, a state that no car can have,
-    #: a node that the map lacks), instead of reading the rest of it.
+    #: Skip a record of which something odd would be left out, such as an agent without a size.
     strict: bool = False
     workers: shared.Workers = 1
     engine: shared.EngineName = "local"
@@ -207,16 +199,7 @@ class Convert(shared.Command):
                 advance(done, total, f"{so_far.converted} converted, {len(so_far.skipped)} skipped")
 
             report = convert(reader, files, out, progress=show, **settings)
-        rows = {
-            "converted": report.converted,
-            "excluded": {name: count for name, count in report.exclusions.items() if count},
-            "skipped": report.problems,
-            "odd": report.odd,
-            "first odd": report.odd_examples,
-            "overlaps": report.overlaps,
-            "joined gaps": report.joined_gaps,
-        }
-        shared.print_facts({name: count for name, count in rows.items() if count}, str(out))
+        Info(store=out, interactive=0)()
         if report.warning:
             shared.warn(report.warning)
 

@@ -39,8 +39,7 @@ class Evaluate(shared.Simulation):
     #: where agents stand at the end, what a search made of the goals, and what becomes of single agents.
     details: bool = False
     keep: bool = True  # Leave the folder of the run as it is.
-    #: More scores for the record and for `symphony table`: `wosac` (2025), of 32 rollouts of everyone for 8 s, by the
-    #: same search or without it (see docs/wosac.md).
+    #: More scores for the record and `symphony table`: `wosac` (2025), 32 rollouts of everyone (see docs/wosac.md).
     metrics: tuple[Literal["wosac"], ...] = ()
 
     def __call__(self) -> None:

@@ -54,9 +54,8 @@ class Command:
 class Simulation(Command):
     """An agent on run segments."""
 
-    #: Folder of a run (see `symphony train`), `pretrained:NAME` (an agent that comes with the
-    #: package), `playback` (the log itself), `constant_velocity` or `idm` (the intelligent driver model, along the
-    #: route of the log).
+    #: Folder of a run (see `symphony train`), `pretrained:NAME` (an agent of the package), `playback` (the log
+    #: itself), `constant_velocity` or `idm` (the intelligent driver model, along the route of the log).
     agent: Annotated[Positional[str], arg(metavar="RUN")]
     data: Path  # Store of run segments to simulate.
     segments: Segments = ()

@@ -10,8 +10,7 @@ from tyro.conf import arg
 import symphony
 from symphony.cli import shared
 from symphony.config import EvaluateConfig
-from symphony.config.checks import Bounds, Positive
-from symphony.config.evaluation import MOST_SECONDS
+from symphony.config.evaluation import check_planner_seconds
 from symphony.errors import ConfigError
 
 
@@ -28,11 +27,9 @@ class Simulate(shared.Simulation):
     #: as the agent all others play back the log. Nothing is searched then, unless --search, --branches or --trees say
     #: so: a search asks the planner once for each branch.
     planner: str = ""
-    #: Seconds that a planner has for one answer; a longer one fails the run.
-    planner_seconds: Annotated[Positive, Bounds(most=MOST_SECONDS)] = 60.0
-    #: Number of runs to simulate (a run is one rollout of one segment) in place of `rollouts`: of as many segments as
-    #: there are, evenly spread, and as few of each as it takes; a few more where the number can't be divided so. 0:
-    #: all segments, `rollouts` of each.
+    planner_seconds: float = 60.0  # Seconds that a planner has for one answer; a longer one fails the run.
+    #: Number of runs to simulate (a run is one rollout of one segment) in place of `rollouts`: evenly spread over the
+    #: segments, a few more where the number can't be divided so. 0: all segments, `rollouts` of each.
     runs: int = 0
     #: Goals of agents, by their ids in the source: `7=lane:103` for a route over the lane of that id, `7=12.5,-40`
     #: for one that comes past a point (metres, in the frame of the segment); all others as the agent draws them.
@@ -40,6 +37,7 @@ class Simulate(shared.Simulation):
     tree: bool = True  # Leave out the branches that a search pruned.
 
     def __post_init__(self) -> None:
+        check_planner_seconds(self.planner_seconds)
         if self.runs < 0 or (self.runs and self.segments):
             raise ConfigError("--runs is a number of runs, and goes without --segments")
         if self.runs and self.config.rollouts != EvaluateConfig.rollouts:
