@@ -230,8 +230,8 @@ def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
             "states": [[step, *(round(value, 6) for value in values[step].tolist())] for step in steps],
         }
         for n in np.flatnonzero(saved.agents == row).tolist():
-            found["driver"], route = saved.drivers[n], saved.route(rollout, n)
-            found["route"] = None if route is None else (route + origin).tolist()
+            found["driver"], route = saved.drivers[n], int(saved.goal[rollout, n])
+            found["route"] = None if route < 0 else (saved.routes[route][:, :2] + origin).tolist()
             for name in ("collision", "offroad"):
                 flags = getattr(saved, name)[rollout, :, n] & saved.counted[rollout, :, n]
                 found[name] = (1 + np.flatnonzero(flags)).tolist()

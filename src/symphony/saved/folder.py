@@ -225,8 +225,9 @@ class RolloutFolder:
         try:
             data = file.read_bytes()
         except OSError as error:
-            message = f"can't be read: {error.strerror or error}"
-            raise DataError(message, file=file, segment=segment) from error
+            raise DataError(
+                f"can't be read: {error.strerror or error}", file=file, segment=segment
+            ) from error
         if hashlib.sha256(data).hexdigest() != entry.sha256:
             raise DataError("damaged: not what was written", file=file, segment=segment, field="sha256")
         return read_tensors(data, file, segment)
@@ -346,8 +347,7 @@ def read_tensors(data: bytes, file: Path, segment_id: str) -> SavedRollouts:
 def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedRollouts:
     """Saved rollouts of arrays whose shapes are not checked yet."""
     if "log_weight" in arrays:
-        message = "is of a search with a tilt, which needs these weights: simulate anew"
-        raise DataError(message, field="log_weight")
+        raise DataError("is of a search with a tilt, which is no more: simulate anew", field="log_weight")
     kinds = {**_SCALARS, "start": int, "drivers": list, "failed": dict}
     for name, kind in (kinds | {"prune_every": int} if "prune_every" in facts else kinds).items():
         if type(facts[name]) is not kind:

@@ -125,22 +125,11 @@ class SavedRollouts:
         """Step of the log at which the last state lies."""
         return self.start + self.steps
 
-    def route(self, rollout: int, agent: int) -> NDArray[np.float32] | None:
-        """Points [P, 2] of the route that driven agent n followed; None for none."""
-        number = int(self.goal[rollout, agent])
-        return None if number < 0 else self.routes[number][:, :2]
-
 
 class World(NamedTuple):
-    """Everyone in one rollout. Legend: A agents, U states.
-
-    Attributes:
-        position: [A, U, 2].
-        heading: [A, U].
-        velocity: [A, U, 2].
-        valid: [A, U].
-        size: [A, 2] length, width.
-        height: [A, U, 2] height and level, see :mod:`symphony.data.levels`; None where the map has no levels.
+    """Everyone in one rollout, A agents at U states: position [A, U, 2], heading [A, U], velocity [A, U, 2], who is
+    there [A, U], length and width [A, 2], height and level [A, U, 2] (see :mod:`symphony.data.levels`), None where
+    the map has no levels.
     """
 
     position: NDArray[np.float64]
