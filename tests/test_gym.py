@@ -134,3 +134,12 @@ def test_actions_segments_and_arguments_that_are_none(store: Path) -> None:
     for action in (-1, env.action_space.n, 1.5, np.nan, np.array([1]), "1"):
         with pytest.raises(ConfigError, match="is not one of"):
             env.step(action)
+
+
+def test_torchrl_makes_it_by_its_name(store: Path) -> None:
+    from torchrl.envs import GymEnv
+
+    import symphony.gym  # noqa: F401
+
+    env = GymEnv("symphony/Driving-v0", data=str(store), observation=SMALL)
+    assert env.rollout(3)["next", "own"].shape == (3, 4)

@@ -20,7 +20,7 @@ from symphony.geometry import levels_apart
 from symphony.geometry.polylines import stations_along
 from symphony.metrics.kinds import STANDING
 from symphony.roadgraph import LaneGraph, lane_of
-from symphony.roadgraph.lines import Near, line_strings, turn_between
+from symphony.roadgraph.graph import Near, line_strings, turn_between
 from symphony.roadgraph.routes import ends_inside
 from symphony.saved.rollouts import SavedRollouts, World
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.roadgraph.graph import LaneGraph
-from symphony.roadgraph.lines import Bools, Indices, Near, turn_between
+from symphony.roadgraph.graph import Bools, Indices, LaneGraph, Near, turn_between
 
 LATERAL = 3.0
 """Metres from a centre line within which a vehicle can be on a lane."""

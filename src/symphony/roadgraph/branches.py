@@ -10,8 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from symphony.geometry.nearest import spans
-from symphony.roadgraph.graph import LaneGraph
-from symphony.roadgraph.lines import Bools, Indices, Reals, turn_between
+from symphony.roadgraph.graph import Bools, Indices, LaneGraph, Reals, turn_between
 
 REACH = 2.0
 """Metres from a region's centre line, or from its entry point, within which a trajectory is on it."""

@@ -10,8 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from symphony.roadgraph.graph import LaneGraph
-from symphony.roadgraph.lines import Reals, arc_lengths
+from symphony.roadgraph.graph import LaneGraph, Reals, arc_lengths
 
 CHORD = 3.0
 """Metres of a piece of a line that has a direction, and over which a change of direction is measured."""

@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from symphony.geometry.polylines import stations_along, to_pieces
-from symphony.roadgraph.graph import LaneGraph
-from symphony.roadgraph.lines import Reals, turn_between
+from symphony.roadgraph.graph import LaneGraph, Reals, turn_between
 from symphony.roadgraph.paths import (
     CHORD,
     arc_lengths,
