@@ -11,6 +11,8 @@ import numpy as np
 FAR = np.array([1300.0, 1050.0])
 """Where the made city lies."""
 STEPS = 25
+AREAS = ((0, -2, 40), (0, 2, 40), (60, -2, 20))
+"""Corner and length of the lanes' areas, which are 4 m wide."""
 
 
 def line(*points: tuple[float, float]) -> list[tuple[float, ...]]:
@@ -52,18 +54,17 @@ def scenario() -> dict[str, Any]:
 
     The recording vehicle drives in the right lane; a cone, a walker and a late car are there too.
     """
-    lane = {"type": "LANE_SURFACE_STREET"}
+    lane, white = {"type": "LANE_SURFACE_STREET"}, {"type": "ROAD_LINE_SOLID_SINGLE_WHITE"}
+    outline, island = (
+        ((0, -2), (0, 6), (80, 6), (80, -2), (0, -2)),
+        ((45, 3), (55, 3), (55, 5), (45, 5), (45, 3)),
+    )
+    areas = [line((x, y), (x + length, y), (x + length, y + 4), (x, y + 4)) for x, y, length in AREAS]
+    drive = {"dataset": "nuscenes", "map": "boston-seaport", "date": "2018-08-01"}
     return {
         "id": "scene-0001",
-        "version": "nuscenesv1.0-mini",
         "length": STEPS,
-        "metadata": {
-            "dataset": "nuscenes",
-            "map": "boston-seaport",
-            "date": "2018-08-01",
-            "ts": np.arange(STEPS) * 0.1,
-            "sdc_id": "ego",
-        },
+        "metadata": {**drive, "ts": np.arange(STEPS) * 0.1, "sdc_id": "ego"},
         "tracks": {
             "8f3a": track(12, 4, 9, first=3),
             "ego": track(0, 0, 10),
@@ -73,30 +74,12 @@ def scenario() -> dict[str, Any]:
         },
         "dynamic_map_states": {},
         "map_features": {
-            "boundary_0": {
-                "type": "ROAD_LINE_SOLID_SINGLE_WHITE",
-                "polyline": ring((0, -2), (0, 6), (80, 6), (80, -2), (0, -2)),
-            },
-            "boundary_1": {
-                "type": "ROAD_LINE_SOLID_SINGLE_WHITE",
-                "polyline": ring((45, 3), (55, 3), (55, 5), (45, 5), (45, 3)),
-            },
-            "right": {
-                **lane,
-                "polyline": line((0, 0), (20, 0), (40, 0)),
-                "polygon": line((0, -2), (40, -2), (40, 2), (0, 2)),
-            },
-            "left": {
-                **lane,
-                "polyline": line((0, 4), (40, 4)),
-                "polygon": line((0, 2), (40, 2), (40, 6), (0, 6)),
-            },
+            "boundary_0": {**white, "polyline": ring(*outline)},
+            "boundary_1": {**white, "polyline": ring(*island)},
+            "right": {**lane, "polyline": line((0, 0), (20, 0), (40, 0)), "polygon": areas[0]},
+            "left": {**lane, "polyline": line((0, 4), (40, 4)), "polygon": areas[1]},
             "on": {**lane, "polyline": np.array(line((40, 0), (60, 0))), "speed_limit_kmh": 100},
-            "end": {
-                **lane,
-                "polyline": line((60, 0), (80, 0)),
-                "polygon": line((60, -2), (80, -2), (80, 2), (60, 2)),
-            },
+            "end": {**lane, "polyline": line((60, 0), (80, 0)), "polygon": areas[2]},
             "paint": {"type": "ROAD_LINE_BROKEN_SINGLE_WHITE", "polyline": line((0, 2), (40, 2))},
         },
     }

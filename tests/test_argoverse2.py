@@ -38,18 +38,12 @@ def test_tracks(tmp_path: Path) -> None:
     np.testing.assert_allclose(segment.heading[5], np.pi)
     assert segment.valid.sum(axis=1).tolist() == [20, 16, 20, 2, 20, 20]
     assert not segment.position[~segment.valid].any()
+    kinds = ("vehicle", "pedestrian", "cyclist", "static", "vehicle", "vehicle")
+    for k, kind in enumerate(kinds):
+        assert segment.agent_type[k] == NOMINAL_SIZES[kind][0]
+        np.testing.assert_array_equal(segment.size[k], np.float32(NOMINAL_SIZES[kind][1]))
     # The focal track, and then the scored one.
     assert (segment.interest.tolist(), segment.predict.tolist()) == ([5], [5, 4])
-
-
-def test_sizes_are_nominal(tmp_path: Path) -> None:
-    for kind, (agent_type, size) in NOMINAL_SIZES.items():
-        columns = scenario()
-        tracks = zip(columns["track_id"], columns["object_type"], strict=True)
-        columns["object_type"] = [kind if track == "9" else known for track, known in tracks]
-        segment = read_one("argoverse2", write(tmp_path, columns))
-        assert segment.agent_type.tolist()[:4] == [1, 2, 3, agent_type]
-        np.testing.assert_array_equal(segment.size[3], np.float32(size))
 
 
 def test_a_scenario_without_its_future(tmp_path: Path) -> None:

@@ -186,22 +186,6 @@ def test_what_a_map_lacks_is_left_out(content: str, kind: str, example: str, tmp
     assert not source.areas
 
 
-@pytest.mark.samples
-def test_sample_maps(samples: Path) -> None:
-    files = sorted(samples.glob("real/interaction/datasets/maps/*.osm"))
-    if not files:
-        pytest.skip("the Lanelet2 samples are not among the samples")
-    for file in files:
-        projection: Any = partial(utm, origin=np.array([49.0, 8.4]))
-        source = read_lanelet2(file, projection)
-        road = road_map(source, middle(source))
-        first, last = (road.lanes.points[road.lanes.offsets[k:][: len(road.lanes)] - k, :2] for k in (0, 1))
-        gaps = np.hypot(*(last[road.successors[:, 0]] - first[road.successors[:, 1]]).T)
-        assert len(gaps) >= 30
-        assert gaps.max() < 1e-3
-        assert 1 < road.lane_width.min() < road.lane_width.max() < 7
-
-
 # Projections
 
 
