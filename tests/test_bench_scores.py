@@ -31,30 +31,26 @@ def test_derivatives_of_polynomials_are_exact(dt: float, count: int, order: int)
     assert derivative(values, dt, order) == pytest.approx(right, abs=1e-6)
 
 
-def drive(dt: float, speed: float, gain: Any = None, turn: Any = None) -> tuple[Reals, Reals]:
-    """Heading and speed of 4 s, of functions of time."""
-    time = np.arange(0, 4 + dt / 2, dt)
-    return (turn(time) if turn else 0 * time), speed + (gain(time) if gain else 0 * time)
-
-
 @pytest.mark.parametrize("dt", [0.1, 0.2])
 @pytest.mark.parametrize(
-    ("kept", "broken"),
+    ("speed", "kind", "kept", "broken"),
     [
-        ((20, lambda t: 2.35 * t), (20, lambda t: 2.45 * t)),
-        ((20, lambda t: -4.0 * t), (20, lambda t: -4.1 * t)),
-        ((10, None, lambda t: 0.485 * t), (10, None, lambda t: 0.495 * t)),  # 4.85 and 4.95 m/s² across
-        ((2, None, lambda t: 0.94 * t), (2, None, lambda t: 0.96 * t)),
+        (20, "along", lambda t: 2.35 * t, lambda t: 2.45 * t),
+        (20, "along", lambda t: -4.0 * t, lambda t: -4.1 * t),
+        (10, "turn", lambda t: 0.485 * t, lambda t: 0.495 * t),  # 4.85 and 4.95 m/s² across
+        (2, "turn", lambda t: 0.94 * t, lambda t: 0.96 * t),
         # Sines, of which the rate is below its limit.
-        ((0, None, lambda t: 0.3 * np.sin(2 * t)), (0, None, lambda t: 0.3 * np.sin(3 * t))),
-        ((20, lambda t: 1.1 * np.sin(1.5 * t)), (20, lambda t: 0.9 * np.sin(2.6 * t))),
+        (0, "turn", lambda t: 0.3 * np.sin(2 * t), lambda t: 0.3 * np.sin(3 * t)),
+        (20, "along", lambda t: 1.1 * np.sin(1.5 * t), lambda t: 0.9 * np.sin(2.6 * t)),
     ],
     ids=["speeds up", "brakes", "sideways", "turns", "turn changes", "jerk"],
 )
-def test_comfort_has_the_published_limits(dt: float, kept: Any, broken: Any) -> None:
+def test_comfort_has_the_published_limits(dt: float, speed: float, kind: str, kept: Any, broken: Any) -> None:
     """Every limit by itself, kept and broken."""
-    assert comfortable(*drive(dt, *kept), dt)
-    assert not comfortable(*drive(dt, *broken), dt)
+    time = np.arange(0, 4 + dt / 2, dt)
+    for changes, comfort in ((kept(time), True), (broken(time), False)):
+        heading, gain = (changes, 0 * time) if kind == "turn" else (0 * time, changes)
+        assert comfortable(heading, speed + gain, dt) == comfort
 
 
 def test_the_score_weighs_its_terms_as_published() -> None:
@@ -95,27 +91,20 @@ def test_another_that_crosses_behind_the_ego_comes_close_in_time(dt: float) -> N
 
 def test_who_follows_in_a_lane_does_not_cross() -> None:
     found = criticality(two(lambda t: (10 * t, 0.0, 0.0, 10.0), lambda t: (-12 + 10 * t, 0.0, 0.0, 10.0)))
-    assert found.encroachment == math.inf
-    assert found.time_to_collision == math.inf
+    assert found.encroachment == found.time_to_collision == math.inf
 
 
 def test_time_to_collision_is_that_of_the_gap() -> None:
     """15 m between bumpers at first, closing at 5 m/s: after 2 s 5 m are left, 1 s."""
-    found = criticality(
-        two(lambda t: (10 * t, 0.0, 0.0, 10.0), lambda t: (19.5 + 5 * t, 0.0, 0.0, 5.0), steps=11)
-    )
+    other = lambda t: (19.5 + 5 * t, 0.0, 0.0, 5.0)  # noqa: E731
+    found = criticality(two(lambda t: (10 * t, 0.0, 0.0, 10.0), other, steps=11))
     assert found.time_to_collision == pytest.approx(1.0, abs=0.01)
 
 
 @given(st.floats(0.0, 8.0))
 def test_braking_counts_from_gentle_to_hard(braking: float) -> None:
-    found = criticality(
-        two(
-            lambda t: (20 * t - braking * t * t / 2, 0.0, 0.0, 20 - braking * t),
-            lambda t: (0.0, 500.0, 0.0, 0.0),
-            steps=6,
-        )
-    )
+    ego = lambda t: (20 * t - braking * t * t / 2, 0.0, 0.0, 20 - braking * t)  # noqa: E731
+    found = criticality(two(ego, lambda t: (0.0, 500.0, 0.0, 0.0), steps=6))
     assert found.braking == pytest.approx(braking, abs=0.01)
     assert found.score == pytest.approx(min(1, max(0, (braking - GENTLE) / (HARD - GENTLE))), abs=0.01)
 

@@ -1,4 +1,6 @@
-"""A planner as the ego: what it observes, that it is forked with its branches, and that its failures are counted."""
+"""A planner as the ego: what it observes, that it is forked with its branches, and that its failures are counted. The
+included ones by hand-made scenes: whom IDM follows, where it stops, and that the log is played back.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +15,19 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from shapely import LineString, Point
 
 from helpers_agents import small
-from helpers_segments import crossing, hide, straight_road
+from helpers_segments import CAR, LANE_WIDTH, crossing, hide, make_road, make_segment, ring, straight_road
 from helpers_store import fill
+from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
+from symphony.data.segment import RunSegment, SignalState
 from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import WHEELBASE
+from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import report
 from symphony.learning.demonstrations import SceneDataset
@@ -36,7 +42,8 @@ from symphony.planners.interface import (
     planner_maker,
 )
 from symphony.planners.view import FunctionPlanner, Observation
-from symphony.rollouts.driving import simulation, spread_runs
+from symphony.roadgraph import LaneGraph
+from symphony.rollouts.driving import Simulation, beside_planner, simulation, spread_runs
 from symphony.saved.folder import RolloutFolder, load_rollouts
 from symphony.saved.saving import save_simulation
 
@@ -74,40 +81,21 @@ class Locked(Wanderer):
         self.lock = threading.Lock()
 
 
-class Odd:
-    """Gives back something odd at step 3 and coasts before."""
-
-    what: Any = None
-
-    def reset(self, scenario: Scenario) -> None:
-        self.scenario = scenario
-
-    def plan(self, traffic: Traffic) -> Any:
-        if traffic.step < 3:
-            return np.zeros(2)
-        return self.what(traffic) if callable(self.what) else self.what
-
-
-class Unready(Odd):
+class Unready(Wanderer):
     def reset(self, scenario: Scenario) -> None:
         raise RuntimeError("not today")
 
 
-def odd(given: Any) -> type[Odd]:
-    return type("Odd", (Odd,), {"what": staticmethod(given) if callable(given) else given})
-
-
-def dataset(agent: Any, count: int = 2, duration: int = 2, interactive: int = 2) -> SceneDataset:
+def dataset(count: int = 2) -> SceneDataset:
     store = SegmentStore(builtin_store("test"))
-    return SceneDataset(store, interactive, agent.dynamics, range(count), routes=True, duration=duration)
+    return SceneDataset(store, 2, small().dynamics, range(count), routes=True, duration=2)
 
 
 def simulated(make: Any, count: int = 2, **settings: Any) -> Any:
-    agent = small()
-    data = dataset(agent, count)
+    data = dataset(count)
     egos = EgoPlanners("mine", make, [data.segment(i) for i in range(count)])
     config = EvaluateConfig(**{"rollouts": 4, "search": "none", **settings})
-    return simulation(agent, data.scenes(range(count)), config, egos=egos, keep_tree=True)
+    return simulation(small(), data.scenes(range(count)), config, egos=egos, keep_tree=True)
 
 
 TREE: dict[str, Any] = {"search": "tree", "branches": 6, "rule": "best", "prune_every": 5}
@@ -166,7 +154,7 @@ def test_it_sees_everyone_and_its_controls_are_a_vehicles() -> None:
             seen.append(traffic)
             return Control(99.0 if traffic.step < 3 else -99.0, 0.0)
 
-    data = dataset(small())
+    data = dataset()
     segment = data.segment(0)
     state = simulated(Pushes, rollouts=1).rollouts.state[0, 0].numpy()
     mine = [t for t in seen if t.ego == segment.ego and np.array_equal(t.size, segment.size[:, :2])]
@@ -194,7 +182,7 @@ def test_it_sees_everyone_and_its_controls_are_a_vehicles() -> None:
 
 def test_it_steers_a_vehicle_of_its_own_length() -> None:
     """Heading by the distance driven: with tan(slip) half of tan(steering), 2 sin(slip) over the wheelbase."""
-    segment = dataset(small()).segment(0)
+    segment = dataset().segment(0)
     state = simulated(partial(FunctionPlanner, lambda _: Control(1.0, 0.2)), rollouts=1)
     path = state.rollouts.state[0, 0, :, 0].double()
     driven = (0.5 * (path[1:, 3] + path[:-1, 3]) * segment.dt).sum()
@@ -207,14 +195,15 @@ def test_it_steers_a_vehicle_of_its_own_length() -> None:
     ("given", "why"),
     [
         (lambda _: 1 / 0, "step 3: ZeroDivisionError: division by zero (test_planner.py:"),
-        ((float("nan"), 0.0), "step 3: ValueError: a plan that is not finite"),
-        (None, "step 3: "),
-        (lambda t: Pose(t.state[0] + 50, t.state[1], 0.0, 5.0), "a target 50.0 m away"),
-        (lambda t: t.position.fill(0), "read-only"),
+        (lambda _: (float("nan"), 0.0), "step 3: ValueError: a plan that is not finite"),
+        (lambda _: None, "step 3: "),
+        (lambda seen: Pose(seen.ego.x + 50, seen.ego.y, 0.0, 5.0), "a target 50.0 m away"),
+        (lambda seen: seen.route.fill(0), "read-only"),
     ],
 )
 def test_what_is_odd_fails_the_run_from_there_on(given: Any, why: str) -> None:
-    found = simulated(odd(given), count=1, rollouts=2)
+    odd = partial(FunctionPlanner, lambda seen: given(seen) if seen.step == 3 else (0.0, 0.0))
+    found = simulated(odd, count=1, rollouts=2)
     assert sorted(found.failed[0]) == [0, 1]
     assert why in found.failed[0][0]
     counted = found.rollouts.counted[0]
@@ -266,10 +255,9 @@ def store(tmp_path: Path) -> Path:
 
 
 def run(store: Path, out: Path, planner: str, batch: int = 2, **settings: Any) -> RolloutFolder:
-    agent = small()
-    data = SceneDataset(SegmentStore(store), 2, agent.dynamics, routes=True, duration=2)
+    data = SceneDataset(SegmentStore(store), 2, small().dynamics, routes=True, duration=2)
     config = EvaluateConfig(rollouts=2, branches=4, batch=batch, **settings)
-    return save_simulation(out, agent, data, config, planner=planner)
+    return save_simulation(out, small(), data, config, planner=planner)
 
 
 def test_the_same_seed_gives_the_same_bytes_in_any_batch(store: Path, tmp_path: Path) -> None:
@@ -345,11 +333,16 @@ def test_runs_are_spread_over_as_many_segments_as_there_are(
         assert (count, how.rollouts) == (runs, 1)
 
 
-def test_a_hundred_runs_are_a_hundred(store: Path, tmp_path: Path) -> None:
+def test_a_hundred_runs_are_a_hundred_and_beside_the_log_the_ego_is_alone(
+    store: Path, tmp_path: Path
+) -> None:
     words = ["--data", str(store), "--planner", "idm", "--duration", "2", "--out", str(tmp_path / "sim")]
     assert main(["simulate", "playback", "--runs", "9", "--rollouts", "3", *words]) == 2
     assert main(["simulate", "playback", "--runs", "9", *words]) == 0
-    assert report(load_rollouts(tmp_path / "sim"), "ego").totals()["runs"] == 9
+    found = load_rollouts(tmp_path / "sim")
+    assert report(found, "ego").totals()["runs"] == 9
+    assert all(saved.drivers == ("idm",) for saved in found)
+    assert main(["simulate", "playback", "--interactive", "2", *words[:-1], str(tmp_path / "two")]) == 1
     words[-1] = str(tmp_path / "searched")
     assert main(["simulate", AGENT, "--runs", "20", "--branches", "4", *words]) == 0
     found = load_rollouts(tmp_path / "searched")
@@ -357,25 +350,10 @@ def test_a_hundred_runs_are_a_hundred(store: Path, tmp_path: Path) -> None:
     assert [entry.rollouts for entry in (*found.entries, *found.failures)] == [8, 8, 8]
 
 
-@pytest.mark.parametrize(
-    ("changes", "kind"), [({}, "none"), ({"search": "tree"}, "tree"), ({"branches": 3}, "tree")]
-)
-def test_beside_a_planner_nothing_is_searched_unless_asked_for(
-    store: Path, tmp_path: Path, changes: Any, kind: str
-) -> None:
+def test_beside_a_planner_nothing_is_searched_unless_asked_for() -> None:
     """A search asks the planner once for each branch."""
-    data = SceneDataset(SegmentStore(store), 2, small().dynamics, routes=True, duration=2)
-    config = EvaluateConfig(rollouts=2, **changes)
-    folder = save_simulation(tmp_path / "sim", small(), data, config, planner=f"{__name__}:Wanderer")
-    assert folder.about.settings["search"] == kind
-    assert (folder[0].trees is None) == (kind == "none")
-
-
-def test_around_log_playback_the_ego_is_alone(store: Path, tmp_path: Path) -> None:
-    words = ["--data", str(store), "--rollouts", "1", "--planner", "idm"]
-    assert main(["simulate", "playback", "--out", str(tmp_path / "one"), *words]) == 0
-    assert all(saved.drivers == ("idm",) for saved in load_rollouts(tmp_path / "one"))
-    assert main(["simulate", "playback", "--out", str(tmp_path / "two"), *words, "--interactive", "2"]) == 1
+    for changes, search in (({}, "none"), ({"search": "tree"}, "tree"), ({"branches": 3}, "tree")):
+        assert beside_planner(EvaluateConfig(rollouts=2, **changes)).search == search  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -404,3 +382,142 @@ def test_one_that_can_not_begin_fails_all_of_its_run() -> None:
     assert set(found.failed[0].values()) == {found.failed[0][0]}
     assert "reset: RuntimeError: not today" in found.failed[0][0]
     assert not found.rollouts.counted.any()
+
+
+LENGTH = CAR[0]
+LIMIT = 14.0
+"""Of hand-made roads, m/s."""
+
+
+def driven(segment: RunSegment, planner: str = "idm") -> Simulation:
+    """The ego by a planner, everyone else as logged."""
+    scenes = scene(segment, [segment.ego], LaneGraph(segment.road))
+    egos = EgoPlanners(planner, planner_maker(planner), [segment])
+    return simulation(load_agent("playback"), scenes, EvaluateConfig(rollouts=1), egos=egos)
+
+
+def states(segment: RunSegment, planner: str = "idm") -> Any:
+    """[T + 1, 4] of the ego in a run that did not fail."""
+    found = driven(segment, planner)
+    assert found.failed == ({},)
+    return found.rollouts.state[0, 0, :, 0].numpy()
+
+
+def in_a_row(speeds: list[float], starts: list[float], steps: int = 131, lane: Any = 0) -> RunSegment:
+    """Cars at constant speeds on a straight road of two lanes, by default all on the first one."""
+    speed, start = np.asarray(speeds, float)[:, None], np.asarray(starts, float)[:, None]
+    x = start + speed * 0.2 * np.arange(steps)
+    y = np.broadcast_to(LANE_WIDTH * np.reshape(lane, (-1, 1)), x.shape)
+    line = np.arange(0.0, 1000.0, 2.0)
+    road = make_road([np.stack([line, np.full_like(line, k * LANE_WIDTH)], -1) for k in (0, 1)])
+    velocity = np.stack([speed + 0 * x, 0 * x], -1)
+    return make_segment(road, np.stack([x, y], -1), 0 * x, velocity)
+
+
+@pytest.mark.parametrize("speed", [3.0, 14.0])
+def test_idm_stops_behind_a_standing_car(speed: float) -> None:
+    found = states(in_a_row([speed, 0], [20, 130]))
+    gap = 130 - found[:, 0] - LENGTH
+    assert gap.min() > 1.5
+    assert gap[-1] < 3.0
+    assert found[-1, 3] < 0.1
+    assert np.diff(found[:, 3]).min() > -0.2 * 6
+    np.testing.assert_allclose(found[:, 1:3], 0, atol=1e-4)
+
+
+def test_idm_keeps_its_place_where_steps_are_long() -> None:
+    """Steps of more metres than are looked at around the last place."""
+    found = states(in_a_row([14, 0], [20, 180], steps=31).replace(dt=2.0))
+    assert np.diff(found[:, 0]).max() > 20
+    assert (180 - found[:, 0] - LENGTH).min() > 0
+    assert found[-1, 3] < 0.5
+
+
+def test_idm_follows_at_its_headway() -> None:
+    """Where nothing changes any more, s = (s0 + v T) / sqrt(1 - (v / v0)^4)."""
+    leader = 8.0
+    found = states(in_a_row([12, leader], [20, 60], steps=201))
+    gap = 60 + leader * 40 - found[-1, 0] - LENGTH
+    assert found[-1, 3] == pytest.approx(leader, abs=0.05)
+    assert gap == pytest.approx((2 + 1.5 * leader) / np.sqrt(1 - (leader / LIMIT) ** 4), abs=0.3)
+
+
+@pytest.mark.parametrize(("aside", "gap"), [(-0.4, 15.0), (0.0, 40.0)])
+def test_idm_stops_behind_a_standing_car_where_its_route_comes_by_twice(gap: float, aside: float) -> None:
+    segment = ring(gap, aside=aside)
+    assert (scene(segment, [0], LaneGraph(segment.road)).route_count.max() * 3 > 2 * np.pi * 15).item()
+    found = states(segment)
+    turned = np.arctan2(found[:, 0], -found[:, 1])
+    ahead = (0.2 + gap / 15 - turned) * 15.0
+    assert ahead.min() > LENGTH + 1.0
+    assert ahead[-1] < LENGTH + 5.0
+    assert found[-1, 3] < 0.5
+
+
+def test_a_car_in_the_next_lane_or_behind_is_nobody_to_follow() -> None:
+    alone = states(in_a_row([10], [60], steps=91))
+    assert alone[-1, 3] == pytest.approx(LIMIT, abs=0.2)
+    assert alone[:, 3].max() <= LIMIT + 1e-3
+    others = states(in_a_row([10, 0, 0], [60, 100, 30], lane=(0, 1, 0), steps=91))
+    np.testing.assert_allclose(alone, others, atol=1e-5)
+
+
+def test_idm_keeps_its_lane_in_turns() -> None:
+    segment = crossing(1, steps=91, seed=1).replace(
+        signal_lane=np.zeros(0, np.int32),
+        signal_point=np.zeros((0, 3), np.float32),
+        signal_state=np.zeros((0, 91), np.uint8),
+    )
+    found = states(segment)
+    logged = LineString(segment.position[0, :, :2])
+    inside = [xy for xy in found[:, :2] if logged.project(Point(xy)) < logged.length - 0.1]
+    assert len(inside) > 45
+    assert max(logged.distance(Point(xy)) for xy in inside) < 0.5
+    turned = np.diff(np.unwrap(found[:, 2])) / 0.2
+    assert np.abs(turned * found[1:, 3]).max() < 4.0
+
+
+def at_a_light(mine: SignalState, others: SignalState) -> RunSegment:
+    """A car 12 m before a crossing, its own light in one state, those of the same approach's turns in another."""
+    segment = crossing(2, steps=61, seed=0).replace(ego=1)
+    path = LineString(segment.position[1, :, :2])
+    state = np.full_like(segment.signal_state, others)
+    leads = [path.distance(Point(segment.road.lanes[int(lane)][6, :2])) < 0.3 for lane in segment.signal_lane]
+    assert sum(leads) == 1
+    state[leads] = mine
+    return segment.replace(signal_state=state)
+
+
+def test_idm_stops_at_its_own_red_light_alone() -> None:
+    red, free = at_a_light(SignalState.STOP, SignalState.GO), at_a_light(SignalState.GO, SignalState.STOP)
+    path = states(red)
+    stop = np.linalg.norm(red.signal_point[:, :2] - path[-1, :2], axis=-1).min()
+    assert path[-1, 3] < 0.1
+    assert 0.5 * LENGTH < stop < 0.5 * LENGTH + 4
+    assert states(free)[-1, 3] > 3
+
+
+def test_off_the_lanes_the_run_fails() -> None:
+    segment = in_a_row([10], [20])
+    found = driven(segment.replace(position=segment.position + np.float32([0, 200, 0])))
+    assert "on no lane" in found.failed[0][0]
+    assert not found.rollouts.counted.any()
+
+
+@pytest.mark.parametrize("segment", [straight_road(3), crossing(4, seed=2)], ids=["straight", "crossing"])
+def test_log_playback_reproduces_the_log(segment: RunSegment) -> None:
+    found = states(segment, "log")
+    np.testing.assert_allclose(found[:, :2], segment.position[0, :, :2], atol=1e-4)
+    np.testing.assert_allclose(found[:, 2], segment.heading[0], atol=1e-4)
+    speed = np.hypot(*segment.velocity[0].T)
+    np.testing.assert_allclose(found[:, 3], speed, atol=1e-4)
+
+
+def test_holes_of_the_log_are_filled_and_its_end_is_told() -> None:
+    whole = straight_road(3, steps=21)
+    found = driven(hide(hide(whole, 0, slice(8, 10)), 0, slice(16, 21)), "log")
+    assert "step 15: ValueError: the log of the ego ends at step 15" in found.failed[0][0]
+    assert found.rollouts.counted[0, 0].all(-1).tolist() == [True] * 15 + [False] * 5
+    path = found.rollouts.state[0, 0, :16, 0].numpy()
+    np.testing.assert_allclose(path[:, :2], whole.position[0, :16, :2], atol=0.1)
+    np.testing.assert_allclose(path[[7, 10], :2], whole.position[0, [7, 10], :2], atol=1e-4)

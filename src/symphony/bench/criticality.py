@@ -132,13 +132,8 @@ def hardest(
     items: Sequence[int] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[tuple[int, Criticality]]:
-    """The most critical run segments of a store, the hardest first; equal ones in their order.
-
-    Args:
-        store: the run segments.
-        count: how many, at most.
-        items: rows of the store to choose from; all by default.
-        progress: called with the segments looked at and their total.
+    """So many of the most critical run segments of a store (or of these rows of it), the hardest first; equal ones in
+    their order. ``progress`` is called with the segments looked at and their total.
     """
     rows = range(len(store)) if items is None else items
     found = []

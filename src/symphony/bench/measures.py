@@ -88,16 +88,11 @@ def estimate(
     confidence: float,
     kind: Literal["rate", "mean"] = "mean",
 ) -> Estimate:
-    """The mean of some values and its one-sided bounds over groups.
+    """The mean of the values of some runs (None where not defined; a rate's are 0 and 100) and its one-sided bounds
+    over groups, each with a confidence between 0.5 and 1.
 
     Bounds of a mean are Student's t; those of a rate are the exact binomial ones of as many independent runs as the
     scatter between groups says there are, and of as many as there are groups where nothing or everything happened.
-
-    Args:
-        values: one for each run; None where it is not defined. A rate's are 0 and 100.
-        groups: of the runs.
-        confidence: of each bound, between 0.5 and 1.
-        kind: of the measure.
     """
     known = [(value, group) for value, group in zip(values, groups, strict=True) if value is not None]
     value = np.array([value for value, _ in known], np.float64)

@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from symphony.agents.agent import load_agent
 from symphony.bench.criticality import hardest
@@ -30,16 +30,8 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 BUILTIN = "builtin:"
 """Before the split of the run segments that come with the package."""
 _NUMBER = (int, float)
-_CROWD = {
-    "interactive": (int, str),
-    "others": str,
-    "search": str,
-    "score": str,
-    "branches": int,
-    "radius": _NUMBER,
-    "persona": str,
-    "duration": int,
-}
+_CROWD = {"interactive": (int, str), "others": str, "search": str, "score": str, "branches": int}
+_CROWD |= {"radius": _NUMBER, "persona": str, "duration": int}
 """Settings of :class:`symphony.config.EvaluateConfig` that a crowd may have."""
 _SUITE = {"name": str, "data": str, "segments": (int, list), "hardest": int, "rollouts": int, "seed": int}
 _LIMIT = {"metric": str, "at_most": _NUMBER, "at_least": _NUMBER, "planners": list, "crowds": list}
@@ -54,8 +46,7 @@ _NEEDED = {"suite": "data", "planner": "planner", "crowd": "agent", "threshold":
 """The key that each table must have."""
 
 
-@dataclass(frozen=True)
-class SuitePlanner:
+class SuitePlanner(NamedTuple):
     """A planner under test."""
 
     name: str
@@ -63,13 +54,15 @@ class SuitePlanner:
     seconds: float
 
 
-@dataclass(frozen=True)
-class Crowd:
+class Crowd(NamedTuple):
     """Who drives around it."""
 
     name: str
     agent: str
     config: EvaluateConfig
+
+
+N = TypeVar("N", SuitePlanner, Crowd)
 
 
 @dataclass(frozen=True)
@@ -151,20 +144,14 @@ def read_suite(path: Path, **shared: Any) -> Suite:
         tables[name] = [_Table(file, name, k, given) for k, given in enumerate(found)]
     with top.at("data"):
         store = SegmentStore(_store(file.beside(top.given["data"])))
-    rollouts = top.given.get("rollouts", 1)
+    sure, rollouts = top.given.get("confidence", 0.95), top.given.get("rollouts", 1)
     if rollouts < 1:
         raise top.wrong("rollouts", f"must be at least 1, is {rollouts}")
-    sure = top.given.get("confidence", 0.95)
     top.check_confidence(sure)
     shared |= {"rollouts": rollouts, "seed": top.given.get("seed", 0)}
-    planners, crowds = (
-        [_planner(one) for one in tables["planner"]],
-        [_crowd(one, shared) for one in tables["crowd"]],
-    )
-    names = {
-        "planners": _distinct(tables["planner"], [one.name for one in planners]),
-        "crowds": _distinct(tables["crowd"], [one.name for one in crowds]),
-    }
+    planners = _distinct(tables["planner"], map(_planner, tables["planner"]))
+    crowds = _distinct(tables["crowd"], (_crowd(one, shared) for one in tables["crowd"]))
+    names = {"planners": [one.name for one in planners], "crowds": [one.name for one in crowds]}
     with top.at("segments"):
         items = _items(store, top.given.get("segments", 0))
     if (count := top.given.get("hardest")) is not None:
@@ -181,7 +168,7 @@ def read_suite(path: Path, **shared: Any) -> Suite:
         _threshold(one, names, sure, groups, compares=bool(baseline)) for one in tables["threshold"]
     ]
     name = top.given.get("name", path.stem)
-    return Suite(name, path, store, items, tuple(planners), tuple(crowds), tuple(thresholds), baseline)
+    return Suite(name, path, store, items, planners, crowds, tuple(thresholds), baseline)
 
 
 @dataclass(frozen=True)
@@ -255,11 +242,14 @@ class _Table:
             raise self.wrong("confidence", f"is between 0.5 and 1, or false, not {value!r}")
 
 
-def _distinct(tables: list[_Table], names: list[str]) -> list[str]:
-    for k, name in enumerate(names):
-        if name in names[:k]:
-            raise tables[k].wrong("name", f"{name!r} is there twice")
-    return names
+def _distinct(tables: list[_Table], given: Iterable[N]) -> tuple[N, ...]:
+    """What tables are read as, if no two have one name."""
+    found: list[N] = []
+    for table, one in zip(tables, given, strict=True):
+        if one.name in [other.name for other in found]:
+            raise table.wrong("name", f"{one.name!r} is there twice")
+        found.append(one)
+    return tuple(found)
 
 
 def _planner(table: _Table) -> SuitePlanner:

@@ -61,7 +61,9 @@ DESCRIPTION = """Realistic and diverse traffic agents learned from logged drivin
 Every command explains itself, as in `symphony data convert --help`. The version: `symphony --version`. With
 SYMPHONY_DEBUG=1 in the environment, errors come with their traceback. Exit status: 0 done, 1 failed, 2 wrong usage,
 3 every simulated run failed."""
-COMMANDS = "data train evaluate table plot simulate view report export planners test wosac agents demo doctor"
+COMMANDS = (
+    "data train evaluate table plot simulate view report export planners test hunt wosac agents demo doctor"
+)
 GROUPS = ("data", "plot", "wosac")
 """Those that have commands of their own."""
 

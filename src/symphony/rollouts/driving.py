@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -72,11 +73,13 @@ def simulation(
     keep_tree: bool = False,
     egos: EgoPlanners | None = None,
     given: Int[Tensor, "B N"] | None = None,
+    toward: Callable[[PlannedEnv, TensorDictBase], Any] | None = None,
 ) -> Simulation:
     """K rollouts of every scene, and how they came about: of a search with the pruned branches, if asked for.
 
     ``egos`` plan the first agent of every scene, which no search scores; the agent drives the others. ``given`` are
-    the numbers of the routes that agents are to follow, -1 where that is left open.
+    the numbers of the routes that agents are to follow, -1 where that is left open. ``toward`` makes, with the
+    environment and the first states, a module of the policy whose ``value`` of states a search lowers, not a score.
 
     Raises:
         ConfigError: if the search needs a discriminator and the agent has none, the agent learned another time
@@ -126,6 +129,8 @@ def simulation(
     if egos is not None:
         planned = ego_policy(env, egos, start, config.seed, RULES, forked=searches)
         actor = TensorDictSequential(actor, planned)
+    lure = None if toward is None else toward(env, start)
+    actor = actor if lure is None else TensorDictSequential(actor, lure)
     # The rollouts [B, trees, taken] that count, of all branches.
     chosen, tree = torch.arange(taken, device=env.device).expand(len(scenes), trees, -1), None
     if not searches:
@@ -150,6 +155,7 @@ def simulation(
                 also=() if planned is None else (keys.PLANNER,),
                 leaves=None if kind == "best" else taken,
                 keep_tree=keep_tree and kind == "tree",
+                value=None if lure is None else lure.value,
             )
         found, steps = rollouts_of(env, start, result.trajectories), result.simulated_steps
         ends = result.trajectories[..., -1]  # a copy of a branch follows the goals of its parent

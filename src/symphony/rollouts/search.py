@@ -74,6 +74,11 @@ def flag_score(state: TensorDictBase) -> Float[Tensor, "*b N"]:
     return (bad.squeeze(-1) & state.get(keys.VALID)).float()
 
 
+def no_score(state: TensorDictBase) -> Float[Tensor, "*b N"]:
+    """Score [..., N] of a search by the value of states alone."""
+    return torch.zeros_like(state.get(keys.STATE)[..., 0])
+
+
 def rule_score(env: DrivingEnv, state: TensorDictBase) -> Float[Tensor, "*b N"]:
     """Score [..., N] of a rule: 1 where an agent collides, is off the road, or would within :data:`AHEAD` collide,
     observed or not, were everyone to keep speed and course.
@@ -174,21 +179,25 @@ def search(
     score: Score = "discriminator",
     ego: bool = True,
     also: Sequence[keys.Key] = (),
+    value: Callable[[TensorDictBase], Tensor] | None = None,
     **returned: Any,
 ) -> BeamSearchResult:
     """Beam search from a start state [..., S], all branches of a tree, to the last logged step. Scenes beside each
     other change nothing.
 
-    It prunes every T_p steps by :func:`realism_score`, and keeps of every step what it takes to observe its states
-    anew, and what is named in ``also``; what is returned are settings of :func:`symphony.collectors.beam_search`.
+    It prunes every T_p steps by :func:`realism_score`, or by a ``value`` of states alone. It keeps of every step what
+    it takes to observe its states anew, and what is named in ``also``; what is returned are settings of
+    :func:`symphony.collectors.beam_search`.
     """
     steps = env.decisions
     try:
         return beam_search(
             env,
             TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
-            realism_score(env, discriminator, score=score, ego=ego),
+            realism_score(env, discriminator, score=score, ego=ego) if value is None else no_score,
             start,
+            value=value,
+            prune_last=value is None,
             steps=steps,
             prune_every=prune_every,
             rule=rule,

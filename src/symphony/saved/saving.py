@@ -72,7 +72,7 @@ def save_simulation(
         names = [dataset.store.ids[i] for i in dataset.indices]
         todo = [i for i, segment in enumerate(names) if not writer.has(segment)]
         if planner:
-            todo = [i for i in todo if _has_ego(writer, dataset, i, config.rollouts)]
+            todo = [i for i in todo if has_ego(writer, dataset, i, config.rollouts)]
         done = len(names) - len(todo)
         drive = partial(_drive, agent, dataset, config, keep_tree, planner, planner_seconds, tuple(goals))
         most = PLANNED if planner and not config.batch else len(names)
@@ -125,7 +125,7 @@ def _drive(
         ]
 
 
-def _has_ego(writer: RolloutWriter, dataset: SceneDataset, item: int, rollouts: int) -> bool:
+def has_ego(writer: RolloutWriter, dataset: SceneDataset, item: int, rollouts: int) -> bool:
     """Whether the first interactive agent of an item is the ego; else it is put on record as failed."""
     segment, why = dataset.segment(item), "the ego is no vehicle that is seen at the first step"
     try:

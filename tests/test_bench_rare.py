@@ -1,0 +1,132 @@
+"""Rare failures: their estimated rate has no bias, on a chain whose rate is known and on the road."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from helpers_segments import straight_road
+from symphony import keys
+from symphony.bench.rare import leaf_weights, resampling
+from symphony.cli import main
+from symphony.collectors import Systematic, beam_search, branch
+from symphony.data.builtin import builtin_store
+from symphony.envs.driving import DrivingEnv
+from symphony.envs.scene import scene
+from symphony.evaluation.report import report
+from symphony.planners.nearness import Nearness
+from symphony.roadgraph import LaneGraph
+from symphony.saved.folder import load_rollouts
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+UP, TOP, STEPS = 0.25, 8, 12
+
+
+class Chain(EnvBase):
+    """One up or down by the action, never below 0; it ends at the top."""
+
+    batch_locked = False
+
+    def __init__(self) -> None:
+        super().__init__(batch_size=[])
+        self.observation_spec = Composite(x=Unbounded((1,)))
+        self.state_spec, self.action_spec = self.observation_spec.clone(), Unbounded((1,))
+
+    def _set_seed(self, seed: int | None) -> None: ...
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        raise NotImplementedError
+
+    def _step(self, td: TensorDictBase) -> TensorDictBase:
+        x = torch.where(td["x"] >= TOP, td["x"], (td["x"] + td["action"]).clamp_min(0.0))
+        zero = torch.zeros_like(x)
+        return TensorDict({"x": x, "reward": zero, "done": zero.bool()}, td.shape)
+
+
+def known_rate() -> float:
+    """The probability that the chain has come to its top, by the law of total probability."""
+    share = np.eye(1, TOP + 1)[0]
+    for _ in range(STEPS):
+        after = np.append(np.zeros(TOP), share[TOP])
+        after[1:] += UP * share[:-1]
+        after[:-2] += (1 - UP) * share[1:-1]
+        after[0] += (1 - UP) * share[0]
+        share = after
+    return float(share[TOP])
+
+
+@pytest.mark.parametrize("rule", [resampling(), Systematic()], ids=["seldom", "always"])
+def test_the_rate_of_a_chain_is_found_without_bias_by_few_branches(rule: Systematic) -> None:
+    """To the exact rate, with an error far below that of as many free rollouts."""
+    torch.manual_seed(0)
+    rows, branches = 200, 64
+    found = beam_search(
+        Chain(),
+        lambda td: td.set("action", 1.0 - 2.0 * (torch.rand(*td.shape, 1) >= UP)),
+        lambda td: torch.zeros_like(td["x"]),
+        branch(TensorDict({"x": torch.zeros(rows, 1)}, [rows]), branches),
+        steps=STEPS,
+        prune_every=2,
+        rule=rule,
+        noise=torch.rand(rows, STEPS // 2),
+        value=lambda td: -0.8 * td["x"].squeeze(-1),
+        prune_last=False,
+        keep=[("next", "x")],
+    )
+    top = found.trajectories["next", "x"][..., -1, 0] >= TOP
+    estimates, rate = (leaf_weights(found) * top).mean(-1), known_rate()
+    error = float(estimates.std()) / math.sqrt(rows)
+    assert rate < 1e-3
+    assert abs(float(estimates.mean()) - rate) < 4 * error
+    # A tenth of the steps of free rollouts with that error.
+    assert 10 * error**2 < rate / (rows * branches)
+
+
+def test_near_is_whoever_is_ahead_and_a_hit_is_remembered() -> None:
+    segment = straight_road(3, steps=3)
+    scenes = scene(segment, [0, 1, 2], LaneGraph(segment.road))
+    env = DrivingEnv(scenes)
+
+    def near(gap: float, speed: float, behind: float = 6.0, hit: float = 0.0) -> float:
+        start = env.start(torch.zeros(1, dtype=torch.int64))
+        x = torch.tensor([0.0, float(scenes.box_size[0, :2, 0].mean()) + gap, -behind])
+        state = torch.stack([x, 0 * x, 0 * x, torch.tensor([speed, 0.0, 0.0])], -1)
+        lure = Nearness(env, start)
+        start.set(keys.STATE, state[None])
+        start.set("hit", torch.full((1, 1), hit))
+        return float(lure.near(start))
+
+    assert near(1.0, 20.0) > near(4.0, 20.0) > near(4.0, 0.0) > 0
+    assert near(300.0, 0.0) == 0
+    assert near(300.0, 0.0, behind=0.5) == 0
+    assert near(-1.0, 5.0) == 1
+    assert near(300.0, 0.0, hit=1.0) == 1
+
+
+def test_the_command_finds_the_rate_of_free_rollouts_and_keeps_what_shows_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    coast, agent, out = EXAMPLES / "coast.py", "pretrained:bc_ts_h", tmp_path / "out"
+    words = f"{agent} --planner {coast}:plan --data {builtin_store('test')} --segments 19".split()
+    kept = f"--metric collision_rate --trees 6 --branches 8 --out {out} --json -".split()
+    assert main(["hunt", *words, *kept]) == 0
+    segment, mean = json.loads(capsys.readouterr().out)
+    assert (segment["rate"], segment["error"], mean["segment"]) == (mean["rate"], mean["error"], None)
+    assert main(["simulate", *words, "--rollouts", "64", "--out", str(tmp_path / "free")]) == 0
+    rate = report(load_rollouts(tmp_path / "free"), "ego").totals()["collision_rate"] / 100
+    assert 0 < rate < 1
+    assert abs(mean["rate"] - rate) < 3 * math.hypot(mean["error"], math.sqrt(rate * (1 - rate) / 64))
+    (saved,) = load_rollouts(out)
+    assert saved.rollouts == segment["shown"] > 0
+    assert saved.collision[:, :, 0].any(1).all()
+    assert main(["hunt", *words, *kept]) == 1  # the folder is not new
+    assert main(["hunt", "idm", *words[1:], "--out", str(tmp_path / "idm")]) == 1  # nothing is random there
