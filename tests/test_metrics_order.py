@@ -9,11 +9,11 @@ import pytest
 import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
-from test_context import CASES, scene
 
 from symphony.data.selection import relations
 from symphony.metrics import order_statistics, passing_gap
 from symphony.metrics.order import REACH
+from test_selection import CASES, scene
 
 STEPS, DT = 60, 0.2
 TIME = torch.arange(STEPS) * DT

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_context import CASES, scene
 
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
@@ -28,6 +27,7 @@ from symphony.wosac.scorer.scenario import STATES
 from symphony.wosac.segments import log_playback, wosac_scenario, wosac_window
 from symphony.wosac.simulate import constant_velocity
 from symphony.wosac.table import COLUMNS, how_in_words, read_wosac, wosac_table
+from test_selection import CASES, scene
 
 AGENT = "pretrained:bc_ts_h"
 RANDOM = "random"
