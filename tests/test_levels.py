@@ -163,18 +163,6 @@ def test_saved_rollouts_are_as_high_as_in_the_simulation() -> None:
     assert world_of(played(overpass(0.0)), 0).height is None
 
 
-def test_a_search_and_a_step_hold_to_it() -> None:
-    env, _ = drive(overpass(HIGH))
-    now = env.start(torch.tensor([0, 0]))
-    hit = torch.zeros_like(now.get(keys.COLLISION))
-    coast = env.dynamics.num_actions // 2
-    for _ in range(30):
-        now.set(keys.ACTION, torch.full((2, 2), coast))
-        now = env.step(now)["next"]
-        hit |= now.get(keys.COLLISION)
-    assert not hit.any()
-
-
 def test_flat_scenes_beside_it_keep_every_number() -> None:
     flat = [straight_road(3, steps=STEPS), crossing(steps=STEPS)]
     alone = DrivingEnv(collate([scene(s, [0, 1]) for s in flat]), observation=SEEN)

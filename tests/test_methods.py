@@ -338,16 +338,6 @@ def test_goal_batches_are_the_choices_of_the_environment(dataset: SceneDataset) 
             assert (label[same] == env.scenes.route_logged[0, agent]).all()
 
 
-def test_goal_batches_start_where_each_vehicle_comes_into_sight(store: Path, dataset: SceneDataset) -> None:
-    """Its route begins beside it, not where it was never seen."""
-    batch = dataset.sample_goals([2], 80, ROUTED, torch.Generator().manual_seed(0))
-    first = batch[keys.ROUTES][:, 0, :, :2].masked_fill(~batch[keys.ROUTES_MASK][:, 0, :, None], 0)
-    assert (first.norm(dim=-1) * ROUTED.distance_scale < 4).all()
-    taken = batch[keys.GOAL][:, 0]
-    own = first[torch.arange(len(taken)), taken].norm(dim=-1) * ROUTED.distance_scale
-    assert (own < 0.5).all()
-
-
 def test_fitted_states_are_those_of_the_experts(dataset: SceneDataset) -> None:
     items = [2, 0, 1]
     scenes = dataset.scenes(items)
@@ -364,16 +354,6 @@ def test_fitted_states_are_those_of_the_experts(dataset: SceneDataset) -> None:
             away = (state[b, :, n, :2] - log[b, :, n, :2]).norm(dim=-1)[valid[b, :, n]]
             assert away.max() < 0.5
     assert not torch.equal(state, log)
-
-
-def test_how_much_is_kept_in_memory_changes_nothing(store: Path, dataset: SceneDataset) -> None:
-    small = SceneDataset(SegmentStore(store), 2, Bicycle(), routes=True, keep=1)
-    for draw in (SceneDataset.sample_states, SceneDataset.sample_goals):
-        one, two = (
-            draw(each, [2, 0, 1], 40, ROUTED, torch.Generator().manual_seed(3)) for each in (small, dataset)
-        )
-        assert (one == two).all()
-    assert len(small.scene.kept) == len(small.experts.kept) == 1
 
 
 def test_one_search_serves_as_many_updates_as_configured(

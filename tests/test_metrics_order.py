@@ -61,23 +61,6 @@ def test_steps_that_are_not_valid_do_not_count() -> None:
     assert gap(along_x(4.0), wild, second_valid=TIME < 7.0) == gap(along_x(4.0), along_y(6.0))
 
 
-def test_the_last_moment_counts() -> None:
-    # The second is within reach of the origin at the very end only, 1.4 m from it.
-    end = float(TIME[-1])
-    mine, theirs = along_x(end - 1.0, 3.0), along_y(end + 1.4 / 3, 3.0)
-    assert gap(mine, theirs) > 0
-    assert math.isnan(gap(mine, theirs, second_valid=end > TIME))
-
-
-def test_a_path_does_not_go_from_where_it_was_seen_to_its_padding() -> None:
-    # Straight from the one place it was seen at to zeros, it would meet the other at the origin.
-    once = torch.zeros_like(EVERY)
-    once[20] = True
-    apart = along_y(6.0)
-    apart[20] = torch.tensor([0.0, -6.0])
-    assert math.isnan(gap(along_x(4.0), apart, second_valid=once))
-
-
 @given(st.floats(1, 11), st.floats(1, 11), st.floats(2, 20), st.floats(2, 20), st.floats(-4, 4))
 @example(1.0, 1.0, 2.0, 3.0, 1.0)
 def test_swapping_turning_and_moving(
@@ -94,14 +77,6 @@ def test_swapping_turning_and_moving(
     assert any(turned == pytest.approx(value, abs=2 * DT / 4, nan_ok=True) for value in found)
 
 
-def test_batches() -> None:
-    a = torch.stack([along_x(4.0), along_x(6.0)])[:, None].expand(2, 3, -1, -1)
-    b = torch.stack([along_y(5.0), along_y(6.5), along_y(9.0)])[None].expand(2, 3, -1, -1)
-    found = passing_gap(a, b, EVERY.expand(2, 3, -1), EVERY.expand(2, 3, -1), DT)
-    expected = [[gap(a[i, j], b[i, j]) for j in range(3)] for i in range(2)]
-    np.testing.assert_allclose(found.numpy(), expected)
-
-
 def test_statistics() -> None:
     nan = math.nan
     log = torch.tensor([2.0, -1.0, nan, 0.0])
@@ -112,12 +87,6 @@ def test_statistics() -> None:
     assert found.pairs == 2
     assert (found.kept, found.reversed, found.apart) == pytest.approx((5 / 8, 1 / 8, 2 / 8))
     assert found.gap_error == pytest.approx((1 + 4 + 1 + 0 + 0 + 1 + 1) / 7)
-
-
-def test_nothing_to_count() -> None:
-    found = order_statistics(torch.zeros(3, 0), torch.zeros(0))
-    assert found.pairs == 0
-    assert math.isnan(found.kept)
 
 
 @pytest.mark.parametrize("case", [

@@ -247,18 +247,6 @@ def test_a_group_without_anything_to_count_is_no_sample() -> None:
     assert math.isnan(scored(inputs).compute()["ade_se"])
 
 
-def test_a_rollout_whose_agents_leave_is_measured_over_the_steps_they_are_there() -> None:
-    inputs = random_inputs(0, batch=1, rollouts=2, agents=1, steps=50)
-    inputs["simulated"][0, 1, :, 5:] = False
-    inputs["displacement"] = torch.tensor([1.0, 3.0])[None, :, None, None].expand(1, 2, 1, 50)
-    inputs["logged"] = torch.ones(1, 1, 50, dtype=torch.bool)
-    metrics = scored(inputs)
-    numbers, (row,) = metrics.compute(), metrics.rows()
-    assert numbers["ade"] == pytest.approx((50 * 1 + 5 * 3) / 55)
-    assert numbers["min_sade"] == pytest.approx(1.0)
-    assert (row["ade"], row["min_sade"]) == (numbers["ade"], numbers["min_sade"])
-
-
 @pytest.mark.parametrize(("agents", "steps"), [(0, 1), (0, 13), (3, 50)])
 def test_padding_changes_no_bit(agents: int, steps: int) -> None:
     """A segment is padded as the longest and fullest of its batch is."""

@@ -20,7 +20,7 @@ from symphony.cli import main
 from symphony.config import AgentConfig, EvaluateConfig, TrainConfig
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
-from symphony.errors import ConfigError, DataError
+from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
 from symphony.evaluation.records import evaluation_name, kept_evaluations
 from symphony.evaluation.table import (
@@ -280,27 +280,6 @@ def test_baselines_leave_nothing_behind(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("args", "status"),
-    [
-        (["table", "--setting", "main"], 2),
-        (["table", "--setting", "short", "--runs", "x"], 2),
-        (["table", "--setting", "main", "--runs", "absent"], 1),
-        (["plot", "curvature", "--out", "x.png"], 2),
-        (["plot", "curvature", "absent", "--out", "x.png"], 1),
-        (["plot", "curvature", "absent", "--out", "x.doc"], 1),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else str(value),
-)
-def test_wrong_usage_is_said(
-    args: list[str], status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(args) == status
-    assert capsys.readouterr().err.strip()
-    assert not list(tmp_path.iterdir())
-
-
 # --- the figure ---
 
 
@@ -319,12 +298,3 @@ def test_bars_are_shares_of_all_visits(tmp_path_factory: Any, counts: list[int],
     assert left < centres[policy > 0].min()
     assert right > centres[policy > 0].max()
     assert axes.get_ylim()[1] > max(drawn["policy"].values.max(), drawn["log"].values.max())
-
-
-def test_figures_of_nothing_are_refused(tmp_path: Path) -> None:
-    some, none = np.ones(21, int), np.zeros(21, int)
-    with pytest.raises(DataError, match="BC: no branching region"):
-        plot_curvature({"BC": (some, none)}, tmp_path / "x.png")
-    with pytest.raises(DataError, match="differ in their number"):
-        plot_curvature({"BC": (some, some), "BC+H": (np.ones(11), np.ones(11))}, tmp_path / "x.png")
-    assert not list(tmp_path.iterdir())
