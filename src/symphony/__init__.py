@@ -12,6 +12,7 @@ from symphony.imports import lazily
 if TYPE_CHECKING:
     from symphony.agents.agent import load_agent as load_agent
     from symphony.collectors import BeamSearchCollector as BeamSearchCollector
+    from symphony.collectors import BeamSearchPlanner as BeamSearchPlanner
     from symphony.collectors import beam_search as beam_search
     from symphony.config.evaluation import EvaluateConfig as EvaluateConfig
     from symphony.config.training import TrainConfig as TrainConfig
