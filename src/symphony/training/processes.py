@@ -101,10 +101,7 @@ class Processes:
 
 @contextmanager
 def processes(device: torch.device) -> Iterator[Processes]:
-    """The processes this one was started with by ``torchrun``, or that have a process group already; else it alone.
-
-    A device ``cuda`` becomes that of each process's own: ConfigError if this machine has fewer than processes.
-    """
+    """The processes that ``torchrun`` started or that have a group; else this one. ConfigError if one lacks a card."""
     begun = dist.is_available() and dist.is_initialized()
     own = dist.is_available() and not begun and dist.is_torchelastic_launched()
     if not own and not begun:
