@@ -25,7 +25,7 @@ FURTHER = {
         *("sources.base.Reader", "conformance.check_reader", "conformance.check_segments"),
     ),
     "envs": ("scene.scene", "gym.DrivingGym"),
-    "modules": ("discriminator.discriminator",),
+    "modules": ("realism.discriminator",),
     "collectors": ("beam_search.beam_search",),
     "roadgraph": ("routes.routes",),
     "metrics": ("choices.choices",),
@@ -57,24 +57,34 @@ ROLE = re.compile(r":(?:class|func|meth|data|mod|attr|exc):`~?([^`]+)`")
 STAR = re.compile(r"(`+[^`]+`+)|\[\*")
 
 
+def homes(file: Path) -> dict[str, str]:
+    """Modules that a package imports its names from."""
+    imports = [
+        n for n in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(n, ast.ImportFrom)
+    ]
+    return {name.name: str(node.module) for node in imports for name in node.names if name.asname}
+
+
 def page(room: str) -> str:
     """The page of a package: all that it exports, then what it does not; recipes with their code."""
     options = "    options:\n      show_root_heading: false\n      show_root_toc_entry: false\n"
     source = "    options:\n      show_source: true\n" if room == "recipes" else ""
     parts = [f"# symphony.{room}\n", f"::: symphony.{room}\n{options}"]
+    file = ROOT / f"src/symphony/{room}/__init__.py"
+    if "__all__ = __dir__()" in file.read_text(encoding="utf-8"):  # names that are not written out
+        parts += [
+            f"::: {home}.{name}\n" for name, home in homes(file).items() if home.startswith("symphony.")
+        ]
     parts += [f"::: symphony.{room}.{name}\n{source}" for name in FURTHER.get(room, ())]
     return "\n".join(parts)
 
 
 def public() -> str:
     """The page of the names that most users need: each with the first sentence of its docstring."""
-    tree = ast.parse((ROOT / "src/symphony/__init__.py").read_text(encoding="utf-8"))
-    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    homes = {name.name: node.module for node in imports for name in node.names}
-    rows = []
+    place, rows = homes(ROOT / "src/symphony/__init__.py"), []
     for name in (name for name in symphony.__all__ if not name.startswith("_")):
         first = as_markdown(inspect.getdoc(getattr(symphony, name)) or "").partition("\n")[0].rstrip(".")
-        rows.append(f"| [`{name}`][{homes[name]}.{name}] | {first} |\n")
+        rows.append(f"| [`{name}`][{place[name]}.{name}] | {first} |\n")
     return TOP + "".join(rows)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 import signal
@@ -107,13 +108,17 @@ def test_a_worker_that_is_killed_is_told() -> None:
     assert not multiprocessing.active_children()
 
 
+OTHER = importlib.import_module("symphony.data.store").__name__
+"""Something that this process has imported and that the tasks don't need."""
+
+
 def imported(names: list[str]) -> tuple[int, int, list[bool]]:
     return os.getppid(), os.getpid(), [name in sys.modules for name in names]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are forked from a server on Linux only")
 def test_workers_share_what_was_imported_for_them() -> None:
-    names = ["symphony.data.store", "numpy", "symphony.no_such_module"]
+    names = [OTHER, "numpy", "symphony.no_such_module"]
     found = list(ordered_map(imported, [names] * 8, workers=2))
     servers, workers = {server for server, _, _ in found}, {worker for _, worker, _ in found}
     assert len(servers) == 1
@@ -138,10 +143,11 @@ def test_leaving_early_abandons_what_is_under_way(tmp_path: Path) -> None:
 
 
 SCRIPT = """
-import sys
-sys.path.insert(0, sys.argv[1])
-from symphony.parallel import WorkerError, ordered_map
-from helpers_tasks import sleep_or_return
+import os, time
+from symphony.parallel import ordered_map
+def sleep_or_return(seconds):
+    time.sleep(seconds)
+    return os.getpid()
 if __name__ == "__main__":
     for pid in ordered_map(sleep_or_return, [0.0, 0.0, 30.0, 30.0, 30.0, 30.0], workers=2):
         print(pid, flush=True)
@@ -152,7 +158,7 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("how", ["SIGINT", "SIGKILL"])
 def test_workers_end_with_the_process_that_started_them(how: str, tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
-    command = [sys.executable, str(tmp_path / "script.py"), str(Path(__file__).parent)]
+    command = [sys.executable, str(tmp_path / "script.py")]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, text=True, start_new_session=True, **pipes) as process:
         assert process.stdout is not None

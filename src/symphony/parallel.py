@@ -25,8 +25,7 @@ R = TypeVar("R")
 Results = Generator[R, None, None]
 Engine = Literal["local", "ray"]
 
-IN_FLIGHT = 2
-"""Tasks per worker that are submitted and not yet collected."""
+IN_FLIGHT = 2  # tasks per worker that are submitted and not yet collected
 # A worker has one core: OpenMP threads of several workers would only take the cores from each other.
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
 # A fork of this very process would inherit torch's threads without their state; a server that only imports has none.

@@ -51,13 +51,13 @@ from symphony.wosac import wosac_pb2 as pb
 from symphony.wosac.meta import SubmissionMeta
 from symphony.wosac.submission import check_submission, required_agents, write_submission
 
-USED, REPORTED = 12, 4
-"""One in so many good segments is used, and of saved rollouts reported and played, which takes far longer."""
-SHORT = range(30)
-"""Steps of the recordings that are changed."""
+USED, REPORTED = (
+    12,
+    4,
+)  # one in so many good segments is used, and saved rollouts reported: it takes far longer
+SHORT = range(30)  # steps of the recordings that are changed
 NAMES = ("aaaa", "bbbb")
-BOMB = 32 << 20
-"""Bytes of zeros in a member of an archive, at times."""
+BOMB = 32 << 20  # bytes of zeros in a member of an archive, at times
 
 
 def reader(name: str, good: Callable[[Path], Path]) -> Target:

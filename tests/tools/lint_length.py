@@ -22,8 +22,7 @@ ROW = re.compile(
 """A row of the table: a room, what it owns and may import, its bound, and its size today if that is larger."""
 FOLDERS = ("src", "tests", "recipes", "examples", "benchmarks")
 LIMIT = 600
-RECIPE = 80
-"""Lines of a recipe, in which a method is to be seen at a glance."""
+RECIPE = 80  # lines of a recipe, in which a method is to be seen at a glance
 
 
 def python(*folders: Path) -> Iterator[tuple[Path, int]]:
@@ -72,9 +71,8 @@ def large_rooms(root: Path) -> list[str]:
         most, now = number(row["today"]) or number(row["bound"]), size(root, room)
         if now > most:
             found.append(f"{room}: {now} {row['unit'] or ' lines'}, may have {most}".replace("  ", " "))
-    folders = {
-        file.relative_to(root / "src" / "symphony").parts[0] for file, _ in python(root / "src" / "symphony")
-    }
+    package = root / "src" / "symphony"
+    folders = {file.relative_to(package).parts[0] for file, _ in python(package)}
     missing = sorted(name for name in folders if not name.endswith(".py") and name not in rows)
     return found + [f"{name}: has no place in the table of {TABLE}" for name in missing]
 

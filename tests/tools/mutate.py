@@ -41,8 +41,7 @@ ROOMS = [
     "metrics",
 ]
 """Where changes are made unless others are asked for: rooms that compute."""
-SECONDS = 300
-"""CPU time that the tests may take with a change: one that makes them go on for ever is noticed, too."""
+SECONDS = 300  # CPU time that the tests may take with a change: one that goes on for ever is noticed, too
 OPERATORS: dict[type, type] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or, ast.Or: ast.And,
@@ -153,9 +152,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument("--changes", type=int, default=10, help="of each module")
     parser.add_argument("--modules", nargs="+", default=ROOMS, help="such as envs, or envs.flags")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--again", type=Path, help="earlier counts: make only the changes that were not noticed"
-    )
+    parser.add_argument("--again", type=Path, help="earlier counts: only the changes that were not noticed")
     parser.add_argument("--out", type=Path, default=Path("out/mutate.json"), help="where the counts are kept")
     given = parser.parse_args(args)
     given.out.parent.mkdir(parents=True, exist_ok=True)
