@@ -101,7 +101,7 @@ class Processes:
 
 @contextmanager
 def processes(device: torch.device) -> Iterator[Processes]:
-    """The processes that ``torchrun`` started or that have a group; else this one. ConfigError if one lacks a card."""
+    """The processes that ``torchrun`` started or that have a group; else this one. ConfigError without a card."""
     begun = dist.is_available() and dist.is_initialized()
     own = dist.is_available() and not begun and dist.is_torchelastic_launched()
     if not own and not begun:
