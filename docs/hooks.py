@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import ast
 import inspect
+import linecache
 import re
 from pathlib import Path
 from typing import Any
 
-from griffe import Extension, Object
+from griffe import Docstring, Extension, Object
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
@@ -24,6 +25,7 @@ FURTHER = {
         *("segment.RunSegment", "store.SegmentStore", "builtin.builtin_store", "convert.convert"),
         *("sources.base.Reader", "conformance.check_reader", "conformance.check_segments"),
     ),
+    "config": ("evaluation.SimulationConfig", "training.RunConfig"),
     "envs": ("scene.scene", "gym.DrivingGym"),
     "modules": ("realism.discriminator",),
     "collectors": ("beam_search.beam_search",),
@@ -101,10 +103,27 @@ def as_markdown(text: str) -> str:
     return STAR.sub(lambda found: found[1] or r"[\*", ROLE.sub(r"`\1`", text))
 
 
+def comment(file: str, line: int) -> str:
+    """What a comment says of the setting on a line of a file: ``#:`` above it, or behind it."""
+    text = linecache.getline(file, line).rpartition("  # ")
+    lines = [text[2].strip()] if text[1] else []
+    while (above := linecache.getline(file, line := line - 1).strip()).startswith("#:"):
+        lines.insert(0, above[2:].strip())
+    return " ".join(lines)
+
+
 class Markdown(Extension):
-    """Rewrites every docstring that is loaded."""
+    """Rewrites every docstring that is loaded; a setting without one has its comment."""
 
     def on_object(self, *, obj: Object, **kwargs: Any) -> None:
         """See :func:`as_markdown`."""
+        if (
+            obj.docstring is None
+            and obj.is_attribute
+            and obj.lineno
+            and obj.path.startswith("symphony.config")
+        ):
+            said = comment(str(obj.filepath), obj.lineno)
+            obj.docstring = Docstring(said, parent=obj) if said else None
         if obj.docstring is not None:
             obj.docstring.value = as_markdown(obj.docstring.value)

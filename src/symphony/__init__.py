@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from symphony.agents.agent import load_agent as load_agent
     from symphony.collectors import BeamSearchCollector as BeamSearchCollector
     from symphony.collectors import BeamSearchPlanner as BeamSearchPlanner
-    from symphony.collectors import beam_search as beam_search
+    from symphony.collectors.beam_search import beam_search as beam_search
     from symphony.config.evaluation import EvaluateConfig as EvaluateConfig
     from symphony.config.training import TrainConfig as TrainConfig
     from symphony.data.builtin import builtin_store as builtin_store
