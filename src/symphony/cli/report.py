@@ -15,7 +15,7 @@ from symphony.files import write_file, write_json
 class Report(shared.Command):
     """Report what happened in saved rollouts: collisions and whose fault, red lights, progress, comfort and more.
 
-    Writes report.html (one page, worst runs first, each a click away from its replay) and report.json.
+    Writes report.html (one page, worst runs first, each a click away from its replay), report.json and report.csv.
     """
 
     folder: shared.Saved
@@ -37,6 +37,7 @@ class Report(shared.Command):
                 found = report(folder, self.evaluated, advance)
             plain, totals = found.plain(), found.totals()
             write_json(out / "report.json", plain)
+            write_file(out / "report.csv", found.csv())
             write_file(out / "report.html", report_page(plain, "view.html" if self.view else None))
             if self.view:
                 write_view(folder, found, out / "view.html")

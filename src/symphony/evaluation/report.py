@@ -1,10 +1,12 @@
 """What happened in saved rollouts: a row for each run, totals with errors over groups of segments.
 
-A run is one rollout of one segment. Percent, metres, seconds; what each number means: ``docs/metrics.md``.
+A run is one rollout of one segment. What each number means: ``docs/metrics.md``.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -27,9 +29,8 @@ from symphony.saved.rollouts import SavedRollouts, world_of
 Evaluated = Literal["interactive", "ego"]
 Row = dict[str, Any]
 Array = NDArray[Any]
-
-LOW_TTC = 1.0
-"""Seconds to a collision below which time counts as spent too near to one."""
+UNITS = {"rates and times": "percent", "lengths": "m", "durations": "s", "motion": "m/s^2, m/s^3"}
+LOW_TTC = 1.0  # seconds to a collision below which time counts as spent too near to one
 KIND_NAMES = {kind: kind.name.lower().replace("_", " ") for kind in CollisionKind}
 _MOTION = ("max_acceleration", "max_braking", "max_jerk", "max_lateral_acceleration")
 _TIMES = ("offroad_time", "wrong_way_time", "blocking_time", "low_ttc_time")
@@ -38,8 +39,8 @@ _WORST = ("at_fault_collision", "collision", "red_lights", *_TIMES)
 _OTHERS = ("min_ttc", "progress", "progress_ratio", "beyond_route", "no_route", "log_distance", "first_event")
 NUMBERS = (*_WORST, *_MOTION, *_OTHERS, "collision_at_states", "collisions", "steps", "logged_steps")
 """Numbers of a run; None for one that is not defined."""
+# What is marked where a flag of an agent is raised: text and label.
 _MARKS = {"offroad": ("leaves the road", "off road"), "blocking": ("blocks traffic", "blocks traffic")}
-"""What is marked where a flag of an agent is raised: text and label."""
 _MEANS: dict[str, tuple[str, float, str | None]] = {
     "collision_rate": ("collision", 100.0, None),
     "collision_rate_at_states": ("collision_at_states", 100.0, None),
@@ -61,26 +62,33 @@ class Report:
     agent: str
     evaluated: Evaluated  # which driven agents: all interactive ones, or the ego
     rows: list[Row] = field(default_factory=list)  # of each run, in the order of segments and rollouts
+    # By kind, type of the other, fault, and whether the other played back the log.
     collisions: Counter[tuple[str, str, bool, bool]] = field(default_factory=Counter)
-    """By kind, type of the other, fault, and whether the other played back the log."""
     events: dict[str, list[Event]] = field(default_factory=dict)  # of each segment, marked in its replay
 
     def worst(self) -> list[Row]:
         """Return the runs, worst first; equal ones in their order."""
-        return sorted(
-            self.rows, key=lambda row: [-bool(row["failed"]), *(-(row[name] or 0.0) for name in _WORST)]
-        )
+        return sorted(self.rows, key=lambda r: [-bool(r["failed"]), *(-(r[name] or 0.0) for name in _WORST)])
 
     def totals(self) -> Row:
-        """Return the numbers of all runs, see :func:`total_numbers`."""
+        """Return the numbers of all runs."""
         return total_numbers(self.rows)
 
     def plain(self) -> Row:
         """Return all of it, as JSON can hold it; collisions by kind and so on, most frequent first."""
         names = ("kind", "other", "at_fault", "with_playback", "collisions")
         kinds = [dict(zip(names, (*key, count), strict=True)) for key, count in self.collisions.most_common()]
-        about = {"agent": self.agent, "evaluated": self.evaluated}
-        return about | self.totals() | {"collisions": kinds, "per_run": self.worst()}
+        about = {"agent": self.agent, "evaluated": self.evaluated, "units": UNITS} | self.totals()
+        return about | {"collisions": kinds, "per_run": self.worst()}
+
+    def csv(self) -> str:
+        """Return the runs, worst first; an apostrophe before what looks like a formula, so that none is run."""
+        names = ("segment", "rollout", "group", "failed", *NUMBERS)
+        rows = [[row.get(name) for name in names] for row in self.worst()]
+        risky = tuple("=+-@")
+        safe = [[f"'{c}" if isinstance(c, str) and c.startswith(risky) else c for c in row] for row in rows]
+        csv.writer(out := io.StringIO(), lineterminator="\n").writerows([names, *safe])
+        return out.getvalue()
 
 
 def report(
