@@ -26,12 +26,7 @@ def nearest_points(scenes: SceneBatch, scene: Tensor, origin: Tensor, count: int
 
 
 def observed_points(
-    scenes: SceneBatch,
-    scene: Tensor,
-    step: Tensor,
-    chosen: Tensor,
-    state: Tensor,
-    config: ObservationConfig,
+    scenes: SceneBatch, scene: Tensor, step: Tensor, chosen: Tensor, state: Tensor, config: ObservationConfig
 ) -> tuple[Tensor, Tensor]:
     """Features [M, N, K, F] of points [M, N, K] and which of them exist; state [M, N, 4]."""
     row = scene[:, None, None].expand(chosen.shape)

@@ -22,20 +22,15 @@ CONFIG |= {"interactive": 2, "metric": []}
 def make_record(values: dict[str, float] | None = None, **changes: Any) -> dict[str, Any]:
     numbers = dict.fromkeys(METRICS, 1.0) | {"curvature_jsd_floor": 0.5} | (values or {})
     counts = [0] * 100 + [3] + [0] * 100
-    return {
+    playback = {"collision_rate_at_states": 0.5, "collision_rate": 0.5, "offroad_time": 0.25, "ade": 0.0}
+    return numbers | {
         "format": 2,
-        **numbers,
         "collision_rate_at_states": numbers["collision_rate"],
         "segments": 4,
         "run": {"updates": 0, "named": False, "checkpoint": 0},
         "data": {"name": "test", "checksum": "ab" * 32},
         "config": CONFIG | changes,
-        "playback": {
-            "collision_rate_at_states": 0.5,
-            "collision_rate": 0.5,
-            "offroad_time": 0.25,
-            "ade": 0.0,
-        },
+        "playback": playback,
         "constant_velocity": dict.fromkeys([*METRICS, "collision_rate_at_states"], 2.0),
         "cost": {"simulation": 6.0},
         "curvature": {"policy": counts, "log": counts},

@@ -64,8 +64,7 @@ def commands(page: str) -> list[list[str]]:
 def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    before = set(sys.modules)
-    space: dict[str, object] = {"__name__": "example"}
+    before, space = set(sys.modules), {"__name__": "example"}
     with contextlib.redirect_stdout(io.StringIO()):
         for text, file in blocks(page, "python"):
             if file:
@@ -73,58 +72,40 @@ def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             else:
                 exec(compile(text, page, "exec"), space)  # noqa: S102
     for name in set(sys.modules) - before:
-        if getattr(sys.modules[name], "__file__", None) and str(tmp_path) in str(sys.modules[name].__file__):
+        if str(tmp_path) in str(getattr(sys.modules[name], "__file__", None)):
             del sys.modules[name]
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if any(c[0] == "symphony" for c in commands(page))])
-def test_commands_are_understood(
-    page: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_are_understood(page: str, monkeypatch: Any, capsys: Any) -> None:
     monkeypatch.setattr(symphony.cli, "guarded", lambda run: 0)  # parsed as ever, but nothing runs
     for words in commands(page):
-        if words[0] == "symphony":
-            assert symphony.cli.main(words[1:]) == 0, (
-                f"{page}: {shlex.join(words)}\n{capsys.readouterr().err}"
-            )
+        status = symphony.cli.main(words[1:]) if words[0] == "symphony" else 0
+        assert status == 0, f"{page}: {shlex.join(words)}\n{capsys.readouterr().err}"
 
 
 def test_other_commands_exist() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
     for page in PAGES:
         for words in commands(page):
-            if words[0] == "make":
-                assert words[1] in targets, f"{page}: {shlex.join(words)}"
-            if words[0] == "python":
-                assert (ROOT / words[1]).is_file(), f"{page}: {shlex.join(words)}"
-        for target in re.findall(r"`make ([a-z-]+)`", (ROOT / page).read_text()):
-            assert target in targets, f"{page}: make {target}"
+            assert words[0] != "make" or words[1] in targets, f"{page}: {shlex.join(words)}"
+            assert words[0] != "python" or (ROOT / words[1]).is_file(), f"{page}: {shlex.join(words)}"
+        assert {*re.findall(r"`make ([a-z-]+)`", (ROOT / page).read_text())} <= targets, page
 
 
-@pytest.fixture(scope="module")
-def tables() -> dict[str, Any]:
-    """The program that writes tables into pages."""
-    return runpy.run_path(str(ROOT / "benchmarks" / "results_page.py"))
-
-
-def test_tables_are_those_of_the_records(tables: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_are_those_of_the_records_which_are_few_and_say_how_they_were_made(capsys: Any) -> None:
+    tables = runpy.run_path(str(ROOT / "benchmarks" / "results_page.py"))
     assert tables["main"](["--check"]) == 0, capsys.readouterr().err
-    blocks = [
-        found[2] for name in tables["PAGES"] for found in tables["BLOCK"].finditer((ROOT / name).read_text())
-    ]
-    assert set(blocks) == {record.stem for record in tables["RECORDS"].glob("*.json")}
-
-
-def test_records_are_few_and_say_how_they_were_made(tables: dict[str, Any]) -> None:
-    records = [json.loads(path.read_text()) for path in tables["RECORDS"].glob("*.json")]
+    pages = "".join((ROOT / name).read_text() for name in tables["PAGES"])
+    records = {path.stem: json.loads(path.read_text()) for path in tables["RECORDS"].glob("*.json")}
+    assert {found[2] for found in tables["BLOCK"].finditer(pages)} == records.keys()
     assert sum(path.stat().st_size for path in tables["RECORDS"].iterdir()) < 1_000_000
     assert len(records) <= 5
-    for record in records:
+    for record in records.values():
         assert record["of"]
         assert set(record["made"]) == {"commit", "command"}
         assert len(record["rows"]) <= 12
-    assert tables["cell"]([3, 0.25], 1) == "3.0 ± 0.2"
-    assert tables["cell"]("–") == "–"
+    assert (tables["cell"]([3, 0.25], 1), tables["cell"]("–")) == ("3.0 ± 0.2", "–")
 
 
 def anchors(page: Path) -> set[str]:
@@ -134,15 +115,13 @@ def anchors(page: Path) -> set[str]:
 
 
 def test_links_lead_somewhere() -> None:
-    pages = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "recipes/README.md")]
-    for page in (*pages, *(ROOT / "docs").glob("*.md")):
+    for page in (ROOT / name for name in PAGES if "reference" not in name):
         for link in re.findall(r"\]\(([^)]+)\)", page.read_text()):
             place, _, anchor = link.partition("#")
-            if link.startswith(("https://", "reference/")):  # the latter are made with the pages
-                continue
-            other = page.parent / place if place else page
-            assert other.exists(), f"{page}: {link}"
-            assert not anchor or anchor in anchors(other), f"{page}: {link}"
+            if not link.startswith(("https://", "reference/")):  # the latter are made with the pages
+                other = page.parent / place if place else page
+                assert other.exists(), f"{page}: {link}"
+                assert not anchor or anchor in anchors(other), f"{page}: {link}"
 
 
 def test_pages_are_short() -> None:

@@ -1,10 +1,12 @@
-"""Every example runs, tiny, and stays short."""
+"""Every example, the notebook, the demo and the table of all methods run, tiny."""
 
 from __future__ import annotations
 
 import importlib
+import json
 import math
 import os
+import runpy
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +17,12 @@ import torch
 
 from helpers_processes import forget, output_of
 from helpers_runs import tiny
+from helpers_segments import crossing, straight_road
+from helpers_store import fill
 from symphony import keys
 from symphony.agents import load_agent
-from symphony.config import EvaluateConfig
+from symphony.cli import main
+from symphony.config import METHODS, EvaluateConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.errors import DataWarning
@@ -164,3 +169,72 @@ def test_a_recipe_learns_with_attention(example: Any, tmp_path: Path) -> None:
     with pytest.warns(DataWarning, match="agent.encoder runs code, 'attention:Others'"):
         agent = load_agent(str(train(config)), trust_code=True)
     assert "keys" in str(agent.policy)
+
+
+def test_every_cell_of_the_notebook_runs_and_is_kept_without_output(
+    tmp_path: Path, monkeypatch: Any, capsys: Any
+) -> None:
+    """Small: the sizes that the first cell sets are others here."""
+    found = json.loads((EXAMPLES.parent / "docs" / "tutorial.ipynb").read_text(encoding="utf-8"))["cells"]
+    cells = [cell for cell in found if cell["cell_type"] == "code"]
+    assert all((cell["outputs"], cell["execution_count"]) == ([], None) for cell in cells)
+    monkeypatch.chdir(tmp_path)
+    space: dict[str, object] = {"__name__": "tutorial"}
+    for number, cell in enumerate(cells):
+        exec(compile("".join(cell["source"]), f"cell {number}", "exec"), space)  # noqa: S102
+        if number == 0:
+            assert {"segments", "rollouts"} <= space.keys()
+            space |= {"segments": 1, "rollouts": 2}
+    assert (tmp_path / "out/tutorial/rollouts.png").stat().st_size > 10_000
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "runs 2.00" in shown
+    assert "failed_runs 0.00" in shown
+
+
+def test_demo(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    """With fewer updates, rollouts and segments than a newcomer gets, over what an earlier demo has left."""
+    store = SegmentStore(builtin_store("test"))
+    fill(tmp_path / "test", [store[i] for i in range(3)])
+    folders = {"train": builtin_store("train"), "test": tmp_path / "test"}
+    monkeypatch.setattr("symphony.data.builtin.builtin_store", folders.__getitem__)
+    earlier = tmp_path / "demo" / "bc_h"
+    earlier.mkdir(parents=True)
+    (earlier / "config.json").write_text("{}")
+    (earlier / "left").touch()
+    assert main(["demo", "--out", str(tmp_path / "demo"), "--steps", "2", "--rollouts", "1"]) == 0
+    assert not (earlier / "left").exists()
+    rows = json.loads((tmp_path / "demo" / "metrics.json").read_text())["rows"]
+    names = ["log playback", "constant velocity", "included BC+TS+H", "your BC+H"]
+    assert [(row["agent"], row["segments"]) for row in rows] == [(name, 3) for name in names]
+    assert rows[0]["ade"] == rows[0]["collision_rate"] == 0
+    assert rows[1]["ade"] > 1
+    # Whatever two updates make of BC+H, an agent that has learned to drive stays on the road.
+    assert rows[2]["search"] == "backtrack"
+    assert rows[2]["offroad_time"] < rows[1]["offroad_time"]
+    sizes = [(tmp_path / "demo" / name).stat().st_size for name in ("included.png", "rollouts.png")]
+    assert 50_000 < sizes[0] < sizes[1]
+    told = capsys.readouterr().out
+    assert f"{rows[1]['ade']:.2f}" in told
+    first, _, second = told.partition("Now one of your own")
+    assert [names[2] in first, names[3] in first, names[3] in second] == [True, False, True]
+    assert len(told.splitlines()) <= 30  # a screen
+
+
+def test_the_table_of_all_methods(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    for split, seed in (("train", 0), ("test", 1)):
+        fill(tmp_path / split, [straight_road(4, seed=seed, steps=6), crossing(4, seed=seed, steps=6)])
+    script = runpy.run_path(str(EXAMPLES.parent / "benchmarks" / "make_table.py"))
+    monkeypatch.setitem(script["main"].__globals__, "builtin_store", lambda split: tmp_path / split)
+    sizes = "--steps 2 --states 8 --agent.hidden 8 --agent.num-points 8 --search.updates 2 "
+    sizes += "--checkpoint-every 2 --batch 1 --search.branches=2 --rollouts 2"
+    out = tmp_path / "out"
+    status = script["main"](["--out", str(out), *sizes.split()])
+    shown = capsys.readouterr()
+    assert status == 0, shown.err
+    lines = (out / "table.md").read_text().splitlines()
+    for method in METHODS:
+        name = method.upper().replace("_", "+")
+        assert sum(line.strip("| *").startswith(f"{name} ") for line in lines) == 1, name
+        config = json.loads((out / method / "config.json").read_text())
+        assert (config["method"], config["steps"], config["search"]["branches"]) == (method, 2, 2)
+    assert "MGAIL+TS+H" in shown.out

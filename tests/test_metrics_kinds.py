@@ -1,4 +1,4 @@
-"""Kinds of collisions: staged ones, and what must not change them."""
+"""Collisions against shapely and by hand; their kinds: staged ones, and what must not change them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from symphony.metrics import CollisionKind, CollisionKinds, collision_kinds, collisions
+from symphony.geometry import box_corners
+from symphony.metrics import CollisionKind, collision_kinds, collisions
 
 KIND = CollisionKind
 STEPS, DT = 10, 0.2
@@ -223,40 +225,100 @@ def test_nobody_meets_whom_is_on_another_level():
     level = torch.tensor([[0.0, 1], [6, 2], [0, 1]])[:, None].expand(3, STEPS + 1, 2)
     found = collision_kinds(**inputs, height=(level[:1], level))
     assert (found.other.tolist(), found.kind.tolist()) == ([2], [KIND.INTO_LEADER])
-    assert collision_kinds(**inputs).other.tolist() == [1]
-    low = level.clone()
+    low, first, second = level.clone(), level.clone(), level.clone()
     low[1, :, 0] = 2.4
-    assert collision_kinds(**inputs, height=(low[:1], low)).other.tolist() == [1]
     # Of a step, both ends must be on another level.
-    for apart in (slice(0, 1), slice(1, 2)):
-        mixed = level.clone()
-        mixed[1] = level[0]
-        mixed[1, apart] = level[1, 0]
-        assert collision_kinds(**inputs, height=(mixed[:1], mixed)).other.tolist() == [1]
-
-
-VEHICLE, WALKER, RIDER, THING = 1, 2, 3, 4
+    first[1, 1:], second[1, :1], second[1, 2:] = level[0, 0], level[0, 0], level[0, 0]
+    for height in (None, *((each[:1], each) for each in (low, first, second))):
+        assert collision_kinds(**inputs, height=height).other.tolist() == [1]
 
 
 @pytest.mark.parametrize(
-    ("other", "expected"),
-    [(VEHICLE, None), (WALKER, KIND.PEDESTRIAN), (RIDER, KIND.CYCLIST), (THING, None), (0, None)],
+    ("other", "expected"), [(0, None), (1, None), (2, KIND.PEDESTRIAN), (3, KIND.CYCLIST), (4, None)]
 )
 @pytest.mark.parametrize("name", list(CASES)[::4])
 def test_the_others_type_names_the_kind(name, other, expected):
     agents, kind, _ = CASES[name]
     types = torch.full((len(agents),), other)
-    types[0] = VEHICLE
+    types[0] = 1
     found = collision_kinds(**stage(*agents) | {"agent_type": types})
     assert found.kind.tolist() == [int(kind if expected is None else expected)]
 
 
-def test_being_hit_from_behind_counts_last():
-    """Of two collisions at the same step, whichever agent has which."""
-    for one in KIND:
-        for two in KIND:
-            pair = torch.tensor([int(one), int(two)])
-            zeros = torch.zeros(2, dtype=torch.int64)
-            kinds = CollisionKinds(pair, zeros, zeros, torch.zeros(2, dtype=torch.bool))
-            order = [*(k for k in KIND if k != KIND.REAR_ENDED), KIND.REAR_ENDED]
-            assert kinds.first()[0] == min((one, two), key=order.index)
+# Collisions themselves
+
+
+def boxes(seed, lead=(2,), agents=7, steps=5, spread=14.0):
+    """Position, heading, size and valid of boxes at random, and three of them in each scene."""
+    rng = np.random.default_rng(seed)
+    position = torch.tensor(rng.uniform(0, spread, (*lead, agents, steps, 2)))
+    heading = torch.tensor(rng.uniform(-7, 7, (*lead, agents, steps)))
+    size = torch.tensor(rng.uniform(0.4, 5, (*lead, agents, 2)))
+    valid = torch.tensor(rng.random((*lead, agents, steps)) < 0.7)
+    subject = torch.tensor(np.stack([rng.permutation(agents)[:3] for _ in range(math.prod(lead))]))
+    return position, heading, size, valid, subject.reshape(*lead, 3)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_collisions_agree_with_shapely(seed):
+    position, heading, size, valid, subject = boxes(seed)
+    shapes = shapely.polygons(box_corners(position, heading, size[..., None, :]).numpy())
+    found = collisions(position, heading, size, valid, subject, at_states=True)
+    assert found.shape == (2, 3, 5)
+    for b, n, t in np.ndindex(2, 3, 5):
+        me = int(subject[b, n])
+        others = [k for k in range(7) if k != me and valid[b, k, t]]
+        area = max(shapely.area(shapely.intersection(shapes[b, me, t], shapes[b, others, t])), default=0)
+        if not 0 < area < 1e-9:
+            assert found[b, n, t] == (bool(valid[b, me, t]) and area > 0)
+
+
+def test_collisions_by_hand():
+    """Three cars in a row: the first two overlap by 12.5 cm at step 1, the last one only touches."""
+    position = torch.zeros(3, 2, 2)
+    position[1, :, 0] = torch.tensor([6.0, 4.375])
+    position[2, :, 0] = torch.tensor([10.5, 8.875])
+    heading, size = torch.zeros(3, 2), torch.tensor([[4.5, 2.0]]).expand(3, 2)
+    valid, subject = torch.ones(3, 2, dtype=torch.bool), torch.tensor([0, 1, 2])
+    found = collisions(position, heading, size, valid, subject, at_states=True)
+    assert found.tolist() == [[False, True], [False, True], [False, False]]
+    assert collisions(position, heading, size, valid, subject).tolist() == [[True], [True], [False]]
+    valid[1, 1] = False
+    assert not collisions(position, heading, size, valid, subject).any()
+
+
+def test_on_another_level_is_so_both_before_and_after_a_step():
+    position, heading = torch.zeros(2, 2, 2), torch.zeros(2, 2)
+    size, valid, subject = torch.tensor([[4.5, 2.0]]).expand(2, 2), torch.ones(2, 2).bool(), torch.tensor([0])
+    level = torch.tensor([[[0.0, 1], [0, 1]], [[6, 2], [6, 2]]])
+    for before, after, z in ((2, 2, 6.0), (1, 2, 6.0), (2, 1, 6.0), (0, 0, 6.0), (2, 2, 2.4)):
+        level[1] = torch.tensor([[z, before], [z, after]])
+        met = (before, after, z) != (2, 2, 6.0)
+        assert collisions(position, heading, size, valid, subject, level).tolist() == [[met]]
+        at_states = collisions(position, heading, size, valid, subject, level, at_states=True)
+        assert at_states.tolist() == [[z < 6 or number < 2 for number in (before, after)]]
+    # Who was not there before is where it is now.
+    valid[1, 0] = False
+    level[1] = torch.tensor([[0.0, 0], [6, 2]])
+    assert not collisions(position, heading, size, valid, subject, level).any()
+
+
+def test_padding_order_and_batch_change_no_collision():
+    position, heading, size, valid, subject = boxes(3)
+    found = collisions(position, heading, size, valid, subject)
+    assert found.any()
+    order = torch.tensor([4, 2, 6, 0, 1, 5, 3])
+    pad = [torch.cat([x[:, order], x[:, :2]], 1) for x in (position, heading, size, valid)]
+    pad[3][:, -2:] = False
+    pad[0][:, -2:] = torch.nan
+    shuffled = torch.cat([torch.argsort(order)[subject], torch.full((2, 1), -1)], 1)
+    again = collisions(*pad, shuffled)
+    assert torch.equal(again[:, :3], found)
+    assert not again[:, 3].any()
+    position, heading, size, valid, subject = boxes(4, lead=(2, 3))
+    whole = collisions(position, heading, size[:, :1], valid, subject[:, :1])
+    assert whole.shape == (2, 3, 3, 4)
+    for b, k in np.ndindex(2, 3):
+        one = collisions(position[b, k], heading[b, k], size[b, 0], valid[b, k], subject[b, 0])
+        assert torch.equal(whole[b, k], one)

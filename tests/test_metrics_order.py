@@ -41,14 +41,10 @@ def test_crossing_paths(mine: float, theirs: float) -> None:
 
 
 def test_paths_that_do_not_meet() -> None:
-    aside = along_x(4.0) + torch.tensor([0.0, 3.5])
-    assert math.isnan(gap(along_x(4.0), aside))
+    assert math.isnan(gap(along_x(4.0), along_x(4.0) + torch.tensor([0.0, 3.5])))
     # The other one stops short of the crossing.
     assert math.isnan(gap(along_x(4.0), along_y(6.0).clamp(max=-3.0)))
-
-
-def test_fast_vehicles_do_not_jump_over_the_place() -> None:
-    # At 30 m/s a step is 6 m.
+    # At 30 m/s a step is 6 m: nobody jumps over the place.
     assert gap(along_x(4.1, 30.0), along_y(6.1, 30.0)) == pytest.approx(2.0, abs=0.1)
 
 
@@ -80,9 +76,7 @@ def test_swapping_turning_and_moving(
 def test_statistics() -> None:
     nan = math.nan
     log = torch.tensor([2.0, -1.0, nan, 0.0])
-    simulated = torch.tensor(
-        [[3.0, -1.0, 1.0, 1.0], [-2.0, nan, 1.0, 1.0], [1.0, 0.0, nan, 1.0], [2.0, -2.0, 1.0, 1.0]]
-    )
+    simulated = torch.tensor([[3.0, -1, 1, 1], [-2, nan, 1, 1], [1, 0, nan, 1], [2, -2, 1, 1]])
     found = order_statistics(simulated, log)
     assert found.pairs == 2
     assert (found.kept, found.reversed, found.apart) == pytest.approx((5 / 8, 1 / 8, 2 / 8))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import pickle
 from typing import Any
@@ -33,29 +34,28 @@ def kinds_of(kind: Any, step: Any = 0, playback: Any = False) -> CollisionKinds:
 def random_inputs(
     seed: int, batch: int = 7, rollouts: int = 4, agents: int = 2, steps: int = 5
 ) -> dict[str, Any]:
-    rng = np.random.default_rng(seed)
-    shape = batch, rollouts, agents, steps
+    rng, shape, logged = np.random.default_rng(seed), (batch, rollouts, agents, steps), (batch, agents, steps)
     hits = np.where(rng.random((2, *shape[:3])) < 0.2, rng.integers(0, 8, (2, *shape[:3])), -1)
     names = [f"s{k:02d}" for k in rng.permutation(batch)]
-    found = {
+    bounded = torch.tensor(rng.random(batch) < 0.9)
+    return {
         "segment_ids": names,
         "groups": names,
         "simulated": torch.ones(shape, dtype=torch.bool),
-        "logged": torch.tensor(rng.random((batch, agents, steps)) < 0.8),
+        "logged": torch.tensor(rng.random(logged) < 0.8),
         "at_states": torch.tensor(rng.random(shape) < 0.02),
-        "offroad": torch.tensor(rng.random(shape) < 0.1),
-        "bounded": torch.tensor(rng.random(batch) < 0.9),
+        "offroad": torch.tensor(rng.random(shape) < 0.1) & bounded[:, None, None, None],
+        "bounded": bounded,
         "displacement": torch.tensor(rng.gamma(2, 2, shape), dtype=torch.float32),
         "speed": torch.tensor(rng.gamma(0.5, 8, shape), dtype=torch.float32),
-        "speed_log": torch.tensor(rng.gamma(0.5, 8, (batch, agents, steps)), dtype=torch.float32),
+        "speed_log": torch.tensor(rng.gamma(0.5, 8, logged), dtype=torch.float32),
         "last": torch.tensor(rng.integers(0, steps, batch)),
         "curvature": [rng.normal(0, 0.1, rng.integers(0, 9)) for _ in range(batch)],
         "curvature_log": [rng.normal(0, 0.2, rng.integers(1, 3)) for _ in range(batch)],
+    } | {
+        name: kinds_of(kind, rng.integers(0, steps, kind.shape), rng.random(kind.shape) < 0.5)
+        for name, kind in zip(("kinds", "kinds_logged"), hits, strict=True)
     }
-    found["offroad"] &= found["bounded"][:, None, None, None]
-    for name, kind in zip(("kinds", "kinds_logged"), hits, strict=True):
-        found[name] = kinds_of(kind, rng.integers(0, steps, kind.shape), rng.random(kind.shape) < 0.5)
-    return found
 
 
 def part(inputs: dict[str, Any], take: list[int]) -> dict[str, Any]:
@@ -63,7 +63,7 @@ def part(inputs: dict[str, Any], take: list[int]) -> dict[str, Any]:
 
     def of(value: Any) -> Any:
         if isinstance(value, CollisionKinds):
-            return CollisionKinds(*(each[take] for each in value))
+            return CollisionKinds(*map(of, value))
         return value[take] if isinstance(value, torch.Tensor) else [value[i] for i in take]
 
     return {name: of(value) for name, value in inputs.items()}
@@ -82,32 +82,27 @@ def same(one: Any, other: Any) -> bool:
 
 def test_distances_and_the_divergence_by_hand() -> None:
     """Two segments, two rollouts, two agents, two steps."""
-    inputs = random_inputs(0, batch=2, rollouts=2, steps=2)
     # Segment 0: agent 0 is 1 m off in rollout 0 and 2 m in rollout 1, agent 1 is 5 m and 3 m off. Together rollout 1
-    # is nearer (10 < 12), although agent 0 alone is nearer in rollout 0.
-    displacement = torch.zeros(2, 2, 2, 2)
-    displacement[0, 0, 0], displacement[0, 0, 1] = 1, 5
-    displacement[0, 1, 0], displacement[0, 1, 1] = 2, 3
-    # Segment 1: of agent 1 only the first step is logged.
-    displacement[1, 0], displacement[1, 1] = 4, 1
+    # is nearer (10 < 12), although agent 0 alone is nearer in rollout 0. Segment 1: 4 m and 1 m, and of agent 1 only
+    # the first step is logged.
+    displacement = torch.tensor([[[1.0, 5], [2, 3]], [[4, 4], [1, 1]]])[..., None].repeat(1, 1, 1, 2)
     displacement[1, :, 1, 1] = 1e6
-    inputs["displacement"], inputs["logged"] = displacement, torch.ones(2, 2, 2, dtype=torch.bool)
-    inputs["logged"][1, 1, 1] = False
-    inputs |= {
+    inputs = random_inputs(0, batch=2, rollouts=2, steps=2) | {
         "segment_ids": ["a", "b"],
-        "curvature": [np.array([0.1, 0.1]), np.array([0.1, -0.2])],
-        "curvature_log": [np.array([0.1]), np.array([-0.2])],
+        "displacement": displacement,
     }
+    inputs["logged"] = torch.tensor([[[True, True], [True, True]], [[True, True], [True, False]]])
+    inputs["curvature"] = [np.array([0.1, 0.1]), np.array([0.1, -0.2])]
+    inputs["curvature_log"] = [np.array([0.1]), np.array([-0.2])]
     metrics = scored(inputs)
-    numbers = metrics.compute()
+    numbers, (first, second) = metrics.compute(), metrics.rows()
     assert numbers["ade"] == pytest.approx(((12 + 10) / 2 + (12 + 3) / 2) / 7)
     assert numbers["min_sade"] == pytest.approx((10 + 3) / 7)
+    assert (first["ade"], first["min_sade"]) == (pytest.approx(11 / 4), pytest.approx(10 / 4))
+    assert (second["ade"], second["min_sade"]) == (pytest.approx(7.5 / 3), pytest.approx(1))
     p, q, m = np.array([0.25, 0.75]), np.array([0.5, 0.5]), np.array([0.375, 0.625])
     divergence = ((p * np.log(p / m)).sum() + (q * np.log(q / m)).sum()) / 2
     assert numbers["curvature_jsd"] == pytest.approx(divergence)
-    first, second = metrics.rows()
-    assert (first["ade"], first["min_sade"]) == (pytest.approx(11 / 4), pytest.approx(10 / 4))
-    assert (second["ade"], second["min_sade"]) == (pytest.approx(7.5 / 3), pytest.approx(1))
 
 
 @settings(max_examples=20, deadline=None)
@@ -153,15 +148,6 @@ def test_every_rate_is_what_plain_counting_finds(seed: int) -> None:
         assert numbers[name] == value, name
 
 
-def test_speeds_are_as_far_apart_as_they_are_shifted() -> None:
-    inputs = random_inputs(3)
-    inputs["logged"] = torch.ones_like(inputs["logged"])
-    inputs["speed_log"] = inputs["speed_log"].clamp(max=30)
-    for shift in (0.0, 1.0, 7.5):
-        inputs["speed"] = inputs["speed_log"][:, None].expand_as(inputs["simulated"]) + shift
-        assert scored(inputs).compute()["agent_speed_distance"] == pytest.approx(shift)
-
-
 def test_what_is_not_simulated_or_logged_is_not_read() -> None:
     inputs = random_inputs(1)
     inputs["simulated"][:, :, 1, 3:] = False
@@ -202,14 +188,12 @@ def test_a_segment_seen_twice_is_refused() -> None:
 
 def test_standard_errors_match_the_bootstrap() -> None:
     metrics = scored(random_inputs(5, batch=150))
-    numbers = metrics.compute()
-    rng = np.random.default_rng(0)
+    numbers, rng = metrics.compute(), np.random.default_rng(0)
     segments, draws = list(metrics.segments.values()), []
     for _ in range(80):
         again = RolloutMetrics()
         for k, i in enumerate(rng.integers(0, 150, 150)):
-            again.segments[str(k)] = pickle.loads(pickle.dumps(segments[i]))  # noqa: S301
-            object.__setattr__(again.segments[str(k)], "group", str(k))
+            again.segments[str(k)] = dataclasses.replace(segments[i], group=str(k))
         draws.append(again.compute())
     # Resampling segments biases the divergence itself, but hardly its spread.
     for name, tolerance in zip(NUMBERS, (0.25, 0.25, 0.25, 0.25, 0.5), strict=True):
@@ -229,13 +213,6 @@ def test_copies_of_a_segment_in_one_group_tell_nothing_new() -> None:
         assert found[f"{name}_se"] == pytest.approx(once[f"{name}_se"])
 
 
-@pytest.mark.parametrize("batch", [1, 7])
-def test_one_group_has_no_error(batch: int) -> None:
-    found = scored(random_inputs(8, batch) | {"groups": batch * ["a"]}).compute()
-    assert found["groups"] == 1
-    assert all(math.isnan(found[f"{name}_se"]) for name in NUMBERS)
-
-
 def test_a_group_without_anything_to_count_is_no_sample() -> None:
     """Of two recordings of which one has no step to compare there is no error, as of one alone."""
     inputs = random_inputs(7, batch=4) | {"groups": ["a", "a", "b", "c"]}
@@ -245,39 +222,38 @@ def test_a_group_without_anything_to_count_is_no_sample() -> None:
         assert (full[name], full[f"{name}_se"]) == (without[name], without[f"{name}_se"])
     inputs["logged"][2] = False
     assert math.isnan(scored(inputs).compute()["ade_se"])
+    one = scored(inputs | {"groups": 4 * ["a"]}).compute()
+    assert all(math.isnan(one[f"{name}_se"]) for name in NUMBERS)
 
 
 @pytest.mark.parametrize(("agents", "steps"), [(0, 1), (0, 13), (3, 50)])
 def test_padding_changes_no_bit(agents: int, steps: int) -> None:
     """A segment is padded as the longest and fullest of its batch is."""
-    inputs = random_inputs(5, batch=3, agents=3, steps=37)
+    inputs, pad = random_inputs(5, batch=3, agents=3, steps=37), torch.nn.functional.pad
     inputs["displacement"] = (inputs["displacement"] / 4) ** 8
     padded = dict(inputs)
     for name, value in list(inputs.items()):
         if isinstance(value, torch.Tensor) and value.ndim > 1:
-            padded[name] = torch.nn.functional.pad(value, (0, steps, 0, agents))
+            padded[name] = pad(value, (0, steps, 0, agents))
         elif isinstance(value, CollisionKinds):
-            padded[name] = kinds_of(
-                *(torch.nn.functional.pad(each, (0, agents), value=-1) for each in value[:2])
-            )
+            padded[name] = kinds_of(*(pad(each, (0, agents), value=-1) for each in value[:2]))
             inputs[name] = kinds_of(*value[:2])
     assert same(scored(padded).rows(), scored(inputs).rows())
     assert same(scored(padded).compute(), scored(inputs).compute())
 
 
 def test_metrics_of_ones_own() -> None:
-    metrics = scored(random_inputs(6, batch=40))
-    values = dict(zip(sorted(metrics.segments), np.random.default_rng(0).random(40), strict=True))
-    for seed in range(9):
-        names = np.random.default_rng(seed).permutation(list(values))
-        assert metrics.mean({name: values[name] for name in names}) == metrics.mean(values), "order"
+    metrics, rng = scored(random_inputs(6, batch=40)), np.random.default_rng(0)
+    values = dict(zip(sorted(metrics.segments), rng.random(40), strict=True))
+    for _ in range(9):
+        assert metrics.mean({name: values[name] for name in rng.permutation(list(values))}) == metrics.mean(
+            values
+        )
     first, second, *_ = values
     some = dict.fromkeys(values, 2.0) | {first: math.nan}
     assert metrics.mean(some) == (2.0, 0.0)
     # Left out, the rest would pass for the mean.
-    mean, error = metrics.mean(some | {second: math.inf})
-    assert mean == math.inf
-    assert math.isnan(error)
+    assert same(metrics.mean(some | {second: math.inf}), (math.inf, math.nan))
     assert all(map(math.isnan, metrics.mean(dict.fromkeys(values, math.nan))))
 
 

@@ -23,7 +23,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-RUNTIME = ["core", *(extra for extra in PROJECT["optional-dependencies"] if extra not in {"dev", "docs"})]
+NEEDS = {
+    extra: list(map(Requirement, lines))
+    for extra, lines in {"core": PROJECT["dependencies"], **PROJECT["optional-dependencies"]}.items()
+}
+RUNTIME = {*NEEDS} - {"dev", "docs"}
 
 
 def pins(file: str = "constraints.txt") -> dict[str, str]:
@@ -44,59 +48,47 @@ def make(*arguments: str, cwd: Path = ROOT, **environment: str) -> subprocess.Co
     return subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, check=False)
 
 
-def needs(extra: str) -> list[Requirement]:
-    lines = PROJECT["dependencies"] if extra == "core" else PROJECT["optional-dependencies"][extra]
-    return [Requirement(line) for line in lines]
-
-
 @pytest.mark.parametrize("file", ["constraints.txt", "constraints-lowest.txt"])
 def test_every_dependency_is_pinned_within_its_range(file: str) -> None:
     found = pins(file)
     # A build tag such as +cpu is found on some package indices only.
     assert all(re.fullmatch(r"[0-9][0-9a-z.]*", version) for version in found.values())
-    for need in (need for extra in ("core", *PROJECT["optional-dependencies"]) for need in needs(extra)):
+    for need in (need for needs in NEEDS.values() for need in needs):
         version = found[canonicalize_name(need.name)]
         assert need.specifier.contains(version, prereleases=True), f"{need}: pinned to {version}"
 
 
-def test_pages_name_the_extras_that_there_are() -> None:
-    readme, index = ((ROOT / page).read_text() for page in ("README.md", "docs/index.md"))
-    for text, line in (
-        (readme, r"# with extras: (.+)"),
-        (readme, r"Extras: (.+)\."),
-        (index, r"The extras are (.+?\(Gymnasium\))\."),
-    ):
-        found = re.search(line, text)
-        assert found is not None
-        words = re.sub(r"\([^)]*\)", "", found[1]).replace(" and ", ", ").replace("`", "")
-        assert {word.strip() for word in words.split(",")} == {*RUNTIME} - {"core"}
+@pytest.mark.parametrize(("page", "line"), [
+    ("README.md", r"# with extras: (.+)"),
+    ("README.md", r"Extras: (.+)\."),
+    ("docs/index.md", r"The extras are (.+?\(Gymnasium\))\."),
+])  # fmt: skip
+def test_pages_name_the_extras_that_there_are(page: str, line: str) -> None:
+    found = re.findall(line, (ROOT / page).read_text())[0]
+    words = re.sub(r"\([^)]*\)", "", found).replace(" and ", ", ").replace("`", "")
+    assert {word.strip() for word in words.split(",")} == RUNTIME - {"core"}
 
 
 def test_the_lowest_versions_are_those_promised_and_the_next_major_ones_are_not() -> None:
-    lowest, pinned = {}, pins()
-    for extra in ("core", *PROJECT["optional-dependencies"]):
-        for need in needs(extra):
-            name, parts = canonicalize_name(need.name), need.specifier
-            lowest[name] = next(part.version for part in parts if part.operator == ">=")
-            major = Version(pinned[name]).major
-            assert extra not in RUNTIME or not parts.contains(f"{major + 1}.0", prereleases=True), need
-    found = pins("constraints-lowest.txt")
+    lowest, pinned, found = {}, pins(), pins("constraints-lowest.txt")
+    for extra, need in ((extra, need) for extra, needs in NEEDS.items() for need in needs):
+        name, parts = canonicalize_name(need.name), need.specifier
+        lowest[name] = next(part.version for part in parts if part.operator == ">=")
+        following = f"{Version(pinned[name]).major + 1}.0"
+        assert extra not in RUNTIME or not parts.contains(following, prereleases=True), need
     assert {name: found[name] for name in pinned} == pinned | lowest
 
 
 def test_pins_reach_everything_the_core_needs() -> None:
-    todo, seen = [need.name for need in needs("core")], set()
+    todo, seen = [need.name for need in NEEDS["core"]], set()
     while todo:
-        name = canonicalize_name(todo.pop())
-        if name in seen:
-            continue
-        seen.add(name)
-        for line in importlib.metadata.requires(name) or []:
-            need = Requirement(line)
-            # What a build of torch for CUDA brings is its own affair.
-            ours = not need.name.startswith(("nvidia-", "cuda-", "triton"))
-            if ours and (need.marker is None or need.marker.evaluate({"extra": ""})):
-                todo.append(need.name)
+        if (name := canonicalize_name(todo.pop())) not in seen:
+            seen.add(name)
+            for need in map(Requirement, importlib.metadata.requires(name) or []):
+                # What a build of torch for CUDA brings is its own affair.
+                ours = not need.name.startswith(("nvidia-", "cuda-", "triton"))
+                if ours and (need.marker is None or need.marker.evaluate({"extra": ""})):
+                    todo.append(need.name)
     tested = importlib.metadata.version("matplotlib") == pins()["matplotlib"]
     assert seen - set(pins("constraints.txt" if tested else "constraints-lowest.txt")) == set()
 
@@ -107,98 +99,87 @@ def test_a_python_too_old_is_named(tmp_path: Path) -> None:
     old.chmod(0o755)
     for python in (str(old), str(tmp_path / "missing")):
         done = make("setup", f"VENV={venv}", f"PYTHON={python}")
-        assert done.returncode != 0
         assert f"error: {python} is missing or older than Python 3.11" in done.stderr
-        assert not venv.exists()
+        assert done.returncode != 0
     old.unlink()
     for tool in filter(shutil.which, ("sh", "make", "test")):
         (tmp_path / tool).symlink_to(str(shutil.which(tool)))
     done = make("setup", f"VENV={venv}", PATH=str(tmp_path))
-    assert done.returncode != 0
     assert "error: needs Python 3.11 or newer" in done.stderr
+    assert done.returncode != 0
+    assert not venv.exists()
 
 
-@pytest.mark.parametrize(
-    ("target", "commands"),
-    [
-        ("demo", "bin/symphony demo --out out/demo"),
-        ("table", "bin/python benchmarks/make_table.py --out out/table"),
-        ("test", "bin/python -m pytest"),
-        ("lint", "ruff check|ruff format --check|codespell|mypy|lint-imports|tests/tools/lint_length.py"),
-        ("docs", "bin/mkdocs build --strict"),
-    ],
-)
+@pytest.mark.parametrize(("target", "commands"), [
+    ("demo", "bin/symphony demo --out out/demo"),
+    ("table", "bin/python benchmarks/make_table.py --out out/table"),
+    ("test", "bin/python -m pytest"),
+    ("lint", "ruff check|ruff format --check|codespell|mypy|lint-imports|tests/tools/lint_length.py"),
+    ("docs", "bin/mkdocs build --strict"),
+])  # fmt: skip
 def test_targets_set_themselves_up_once(target: str, commands: str, tmp_path: Path) -> None:
-    first = make("--dry-run", target, f"VENV={tmp_path}").stdout
-    assert [line for line in first.splitlines() if "-c constraints.txt -e" in line]
-    extras = ",".join(PROJECT["optional-dependencies"])
-    listed = re.search(r"-e '\.\[(.+)\]'", first)
-    assert (listed is not None) == (target not in {"demo", "table"})
-    assert listed is None or sorted(listed[1].split(",")) == sorted(extras.split(","))
-    (tmp_path / ".core").touch()
-    (tmp_path / ".dev").touch()
-    again = make("--dry-run", target, f"VENV={tmp_path}").stdout
-    assert "pip" not in again
-    for command in commands.split("|"):
-        assert command in first
-        assert command in again
-
-
-@pytest.mark.parametrize("changed", ["pyproject.toml", "constraints.txt"])
-def test_a_change_of_the_dependencies_installs_again(changed: str, tmp_path: Path) -> None:
+    """And again after a change of the dependencies."""
     for name in ("Makefile", "pyproject.toml", "constraints.txt"):
         shutil.copyfile(ROOT / name, tmp_path / name)
-    venv = tmp_path / ".venv"
-    venv.mkdir()
+    (venv := tmp_path / ".venv").mkdir()
+
+    def told() -> str:
+        return make("--dry-run", target, f"VENV={venv}", cwd=tmp_path).stdout
+
+    first = told()
+    assert [line for line in first.splitlines() if "-c constraints.txt -e" in line]
+    listed = re.search(r"-e '\.\[(.+)\]'", first)
+    assert (listed is not None) == (target not in {"demo", "table"})
+    assert listed is None or sorted([*listed[1].split(","), "core"]) == sorted(NEEDS)
     for stamp in (venv / ".core", venv / ".dev"):
         stamp.touch()
-    assert "pip" not in make("--dry-run", "test", cwd=tmp_path).stdout
-    later = (venv / ".dev").stat().st_mtime + 10
-    os.utime(tmp_path / changed, (later, later))
-    assert make("--dry-run", "test", cwd=tmp_path).stdout.count("pip install") == 2
+    again = told()
+    assert "pip" not in again
+    assert all(command in first and command in again for command in commands.split("|"))
+    later = (venv / ".dev").stat().st_mtime
+    for changed in ("pyproject.toml", "constraints.txt"):
+        os.utime(tmp_path / changed, (later + 10, later + 10))
+        assert "pip install" in told()
+        os.utime(tmp_path / changed, (later - 10, later - 10))
 
 
 def test_a_wheel_holds_all_of_the_package(tmp_path: Path) -> None:
-    source = tmp_path / "source"
-    source.mkdir()
+    (source := tmp_path / "source").mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copyfile(ROOT / name, source / name)
     ignored = shutil.ignore_patterns("__pycache__", "*.egg-info")
-    shutil.copytree(ROOT / "recipes", source / "recipes", ignore=ignored)
-    shutil.copytree(ROOT / "src", source / "src", ignore=ignored, symlinks=True)
+    for name in ("recipes", "src"):
+        shutil.copytree(ROOT / name, source / name, ignore=ignored, symlinks=True)
     code = "from setuptools.build_meta import build_wheel; build_wheel('..')"
-    done = subprocess.run(
-        [sys.executable, "-W", "default", "-c", code], cwd=source, capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-W", "default", "-c", code]
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     (wheel,) = tmp_path.glob("symphony_traffic-*.whl")
     held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
-    package = ROOT / "src"
-    files = {
-        str(file.relative_to(package))
-        for file in (package / "symphony").rglob("*")
-        if file.is_file() and "__pycache__" not in file.parts
-    }
+    files = [
+        path
+        for path in (ROOT / "src" / "symphony").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    ]
     # A link to a folder at the top, whose files no search of this kind finds.
-    files |= {f"symphony/recipes/{file.name}" for file in (ROOT / "recipes").glob("*.py")}
-    assert held == files
-    for part in ("py.typed", "data/builtin/test/store.json", "pretrained/bc_ts_h/config.json"):
-        assert f"symphony/{part}" in held
+    recipes = {f"symphony/recipes/{file.name}" for file in (ROOT / "recipes").glob("*.py")}
+    assert held == recipes | {str(file.relative_to(ROOT / "src")) for file in files}
+    assert held >= {
+        f"symphony/{part}"
+        for part in ("py.typed", "data/builtin/test/store.json", "pretrained/bc_ts_h/config.json")
+    }
 
 
 def test_ci_runs_lint_then_tests(tmp_path: Path) -> None:
-    log = tmp_path / "log"
-    fake = tmp_path / "make"
+    log, fake, browser = tmp_path / "log", tmp_path / "make", tmp_path / "chromium"
     fake.write_text(f'#!/bin/sh\necho "$PWD $@ $SYMPHONY_SKIPS" >> {log}\n[ "$1" != "$FAIL" ]\n')
-    (tmp_path / "chromium").touch()  # or one would be installed
-    for program in (fake, tmp_path / "chromium"):
+    browser.touch()  # or one would be installed
+    for program in (fake, browser):
         program.chmod(0o755)
-    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "FAIL": "", "SYMPHONY_SKIPS": ""}
+    env = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "SYMPHONY_SKIPS": ""}
     for failing, expected in (("", ["lint ", "test 1"]), ("lint", ["lint "]), ("test", ["lint ", "test 1"])):
         log.unlink(missing_ok=True)
-        done = subprocess.run(
-            [ROOT / ".ci/run"], cwd=tmp_path, env=environment | {"FAIL": failing}, check=False
-        )
+        done = subprocess.run([ROOT / ".ci/run"], cwd=tmp_path, env=env | {"FAIL": failing}, check=False)
         assert log.read_text().splitlines() == [f"{ROOT} {target}" for target in expected]
         assert (done.returncode == 0) == (failing == "")
 
@@ -233,17 +214,15 @@ def test_long_files_and_rooms_are_found(tmp_path: Path) -> None:
 
 def skeleton(root: Path) -> Path:
     """A package with our packages' names and nothing in them."""
-    package = root / "symphony"
-    package.mkdir()
-    (package / "__init__.py").write_text("")
-    for path in sorted((ROOT / "src" / "symphony").iterdir()):
-        if path.is_dir() and (path / "__init__.py").exists():
-            (package / path.name).mkdir()
-            (package / path.name / "__init__.py").write_text("")
-        elif path.suffix == ".py":
-            (package / path.name).write_text("")
-    (package / "wosac" / "scorer").mkdir()  # a contract of its own
-    (package / "wosac" / "scorer" / "__init__.py").write_text("")
+    package, source = root / "symphony", ROOT / "src" / "symphony"
+    for path in (
+        *source.glob("*.py"),
+        *source.glob("*/__init__.py"),
+        source / "wosac" / "scorer" / "__init__.py",
+    ):
+        file = package / path.relative_to(source)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
     shutil.copyfile(ROOT / ".importlinter", root / ".importlinter")
     return package
 
@@ -266,29 +245,16 @@ IMPORTS = [
 ]
 
 
-def linted(root: Path, allowed: bool) -> subprocess.CompletedProcess[str]:
-    package = skeleton(root)
-    for file, line, fine in IMPORTS:
-        if fine == allowed:
-            (package / file).write_text(line + "\n")
-    command = [Path(sys.executable).with_name("lint-imports"), "--no-cache"]
-    environment = os.environ | {"PYTHONPATH": str(root)}
-    return subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
-
-
 def test_imports_that_flow_one_way_pass_and_others_are_found(tmp_path: Path) -> None:
-    for allowed, folder in ((True, tmp_path / "one"), (False, tmp_path / "two")):
-        folder.mkdir()
-        done = linted(folder, allowed)
+    command = [Path(sys.executable).with_name("lint-imports"), "--no-cache"]
+    for allowed, root in ((True, tmp_path / "one"), (False, tmp_path / "two")):
+        package, env = skeleton(root), os.environ | {"PYTHONPATH": str(root)}
+        for file, line, fine in IMPORTS:
+            if fine == allowed:
+                (package / file).write_text(line + "\n")
+        done = subprocess.run(command, cwd=root, env=env, capture_output=True, text=True, check=False)
         assert done.returncode == (0 if allowed else 1), done.stdout + done.stderr
     for file, line, allowed in IMPORTS:
         importer, imported = file.removesuffix(".py").replace("/", "."), line.rpartition("symphony.")[2]
         chain = f"symphony.{importer} -> symphony.{imported}" if imported else f"symphony.{importer}"
         assert allowed or chain in done.stdout, done.stdout
-
-
-def test_license_is_the_one_declared() -> None:
-    text = (ROOT / "LICENSE").read_text()
-    assert PROJECT["license"] == "Apache-2.0"
-    assert "Apache License" in text
-    assert "END OF TERMS AND CONDITIONS" in text

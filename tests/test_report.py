@@ -37,22 +37,18 @@ ABOUT = About("made")
 DT = 0.2
 
 
-def driving(
-    *ways: tuple[float, float, float, float], steps: int = 21, lanes: int = 2, **changes: Any
-) -> RunSegment:
+def driving(*ways: tuple[float, float, float, float], steps: int = 21, **changes: Any) -> RunSegment:
     """Cars at constant velocity: x, y, heading, speed at first; two lanes along +x, at y = 0 and above."""
-    start = np.array(ways, float)
-    time = np.arange(steps) * DT
+    start, time = np.array(ways, float), np.arange(steps)[:, None] * DT
     direction = np.stack([np.cos(start[:, 2]), np.sin(start[:, 2])], -1)
     velocity = np.repeat((start[:, 3:] * direction)[:, None], steps, 1)
-    position = start[:, None, :2] + time[:, None] * velocity
     x = np.arange(-100, 200, 2.0)
-    lines = [np.stack([x, np.full_like(x, k * LANE_WIDTH)], -1) for k in range(lanes)]
+    lines = [np.stack([x, np.full_like(x, k * LANE_WIDTH)], -1) for k in range(2)]
     # Far away; left of its direction is the road.
     boundary = [np.array([[-500, -500], [500, -500], [500, 500], [-500, 500], [-500, -500.0]])]
-    road = make_road(lines, boundary=boundary)
     heading = np.repeat(start[:, 2:3], steps, 1)
-    return make_segment(road, position, heading, velocity, DT, **changes)
+    position = start[:, None, :2] + time * velocity
+    return make_segment(make_road(lines, boundary=boundary), position, heading, velocity, DT, **changes)
 
 
 @settings(max_examples=40, deadline=None)
@@ -81,22 +77,17 @@ def test_time_to_collision_is_when_boxes_meet_that_go_on(one: Any, two: Any) -> 
 
 
 def test_a_known_profile_has_its_acceleration_jerk_and_lateral_acceleration() -> None:
-    """Speed t^3 / 3: acceleration and jerk are differences of it; a circle of 20 m at 10 m/s: 5 m/s^2."""
-    segment = driving((0, 0, 0, 10), steps=11)
-    time = np.arange(11) * DT
-    saved = played(segment)
-    saved.state[0, :, 0, 3] = 5 - time**3 / 3
+    """Speed 5 - t^3 / 3: acceleration and jerk are differences of it; a circle of 20 m at 10 m/s: 5 m/s^2."""
+    saved, time = played(driving((0, 0, 0, 10), steps=11), rollouts=2), np.arange(11) * DT
+    saved.state[0, :, 0, 3] = speed = 5 - time**3 / 3
     saved.state[0, :, 0, 2] = 0
-    row = rows(saved)[0]
-    speed = 5 - time**3 / 3
-    assert row["max_braking"] == pytest.approx(-np.diff(speed).min() / DT, rel=1e-4)
-    assert row["max_jerk"] == pytest.approx(np.abs(np.diff(speed, 2)).max() / DT**2, rel=1e-3)
-    assert row["max_lateral_acceleration"] == 0
-    turning = played(segment)
-    turning.state[0, :, 0, 2] = 3 + 0.5 * time
-    turning.state[0, :, 0, 3] = 10
-    assert rows(turning)[0]["max_lateral_acceleration"] == pytest.approx(5, rel=1e-4)
-    assert rows(turning)[0]["max_jerk"] == 0
+    saved.state[1, :, 0, 2] = 3 + 0.5 * time
+    saved.state[1, :, 0, 3] = 10
+    straight, turning = rows(saved)
+    assert straight["max_braking"] == pytest.approx(-np.diff(speed).min() / DT, rel=1e-4)
+    assert straight["max_jerk"] == pytest.approx(np.abs(np.diff(speed, 2)).max() / DT**2, rel=1e-3)
+    assert straight["max_lateral_acceleration"] == turning["max_jerk"] == 0
+    assert turning["max_lateral_acceleration"] == pytest.approx(5, rel=1e-4)
 
 
 def rows(saved: SavedRollouts, evaluated: Any = "interactive") -> list[dict[str, Any]]:
@@ -105,76 +96,50 @@ def rows(saved: SavedRollouts, evaluated: Any = "interactive") -> list[dict[str,
     return found.rows
 
 
-def test_progress_is_along_the_route_and_relative_to_the_log() -> None:
+@pytest.mark.parametrize("lines", [[], [np.array([[-50, 0], [300, 0.0]])]])
+def test_progress_is_along_the_route_and_relative_to_the_log(lines: list[Any]) -> None:
     segment = driving((0, 0, 0, 10), steps=11)
-    saved = played(segment, rollouts=3)
+    saved, routes = played(segment, rollouts=4), Polylines.of(lines)
     saved.state[1, :, 0, 0] = 0.5 * saved.state[0, :, 0, 0]
     saved.state[2, :, 0, :2] = 0
-    for routes in (Polylines.of([]), Polylines.of([np.array([[-50, 0], [300, 0.0]])])):
-        goal = np.full((3, 1), len(routes) - 1)
-        found = rows(dataclasses.replace(saved, routes=routes, goal=goal))
-        assert [row["progress"] for row in found] == pytest.approx([20, 10, 0], abs=1e-4)
-        assert [row["progress_ratio"] for row in found] == pytest.approx([1, 0.5, 0], abs=1e-5)
-    # Driving across the route is no progress along it.
-    aside = played(segment)
-    aside.state[0, :, 0, :2] = aside.state[0, :, 0, 1::-1]
-    goal, routes = np.zeros((1, 1), np.int64), Polylines.of([np.array([[-50, 0], [300, 0.0]])])
-    assert rows(dataclasses.replace(aside, routes=routes, goal=goal))[0]["progress"] == pytest.approx(
-        0, abs=1e-4
+    saved.state[3, :, 0, :2] = saved.state[0, :, 0, 1::-1]  # across the route, which is no progress along it
+    ways = dataclasses.replace(saved, routes=routes, goal=np.full((4, 1), len(routes) - 1))
+    found = rows(ways)
+    assert [row["progress"] for row in found[: 3 + len(lines)]] == pytest.approx(
+        [20, 10, 0, 0][: 3 + len(lines)], abs=1e-4
     )
+    assert [row["progress_ratio"] for row in found[:3]] == pytest.approx([1, 0.5, 0], abs=1e-5)
     assert found[1]["log_distance"] == pytest.approx(0.5 * 2 * np.arange(1, 11).mean(), rel=1e-5)
+    # Who drives as the log does gets on as far, also where the log has lost it for a part of the time.
+    for known in (slice(0, 5), slice(3, 11)):
+        valid = np.zeros_like(segment.valid)
+        valid[:, known] = True
+        row = rows(dataclasses.replace(ways, segment=segment.replace(valid=valid)))[0]
+        assert row["progress"] == pytest.approx(20 if valid[0, 0] else 18, abs=1e-4)
+        assert row["progress_ratio"] == pytest.approx(1)
 
 
-@pytest.mark.parametrize("known", [slice(0, 5), slice(3, 11)])
-@pytest.mark.parametrize("routes", [[], [np.array([[-50, 0], [300, 0.0]])]])
-def test_progress_is_relative_to_the_log_while_there_is_one(known: slice, routes: list[Any]) -> None:
-    """Who drives as the log does gets on as far, also where the log has lost it for a part of the time."""
-    segment = driving((0, 0, 0, 10), steps=11)
-    saved, valid = played(segment), np.zeros_like(segment.valid)
-    valid[:, known] = True
-    lines, goal = Polylines.of(routes), np.full((1, 1), len(routes) - 1)
-    (row,) = rows(dataclasses.replace(saved, segment=segment.replace(valid=valid), routes=lines, goal=goal))
-    assert row["progress"] == pytest.approx(20 if valid[0, 0] else 18, abs=1e-4)
-    assert row["progress_ratio"] == pytest.approx(1)
-
-
-def red(states: Any = SignalState.STOP, **changes: Any) -> list[tuple[int, int]]:
+def red(states: Any = SignalState.STOP, others: Any = SignalState.GO) -> list[tuple[int, int]]:
     """Step and light of every red light that a car runs which comes from the south and goes straight on."""
-    segment = crossing(1, steps=31, seed=0, **changes)
+    segment = crossing(1, steps=31, seed=0)
     path = np.stack([np.full(31, 1.75), -20 + np.arange(31) * 1.2], -1)
     position = np.pad(path, ((0, 0), (0, 1)))[None].astype("f4")
-    light = np.full((12, 31), SignalState.GO, np.uint8)
+    light = np.full((12, 31), others, np.uint8)
     light[0] = states
     heading = np.full((1, 31), np.pi / 2, np.float32)
     segment = segment.replace(position=position, heading=heading, signal_state=light)
-    saved = played(segment)
-    found = red_lights(world_of(saved, 0), np.array([0]), Lanes(segment), 0)
+    found = red_lights(world_of(played(segment), 0), np.array([0]), Lanes(segment), 0)
     return list(zip(found.step.tolist(), found.light.tolist(), strict=True))
 
 
 def test_a_red_light_is_run_where_the_front_crosses_the_stop_point() -> None:
     # The front, 2.3 m ahead of the centre, crosses y = -12 after (20 - 2.3 - 12) / 1.2 steps.
-    assert red() == [(5, 0)]
-    assert red(SignalState.ARROW_STOP) == [(5, 0)]
-    for state in (SignalState.GO, SignalState.CAUTION, SignalState.FLASHING_STOP, SignalState.UNKNOWN):
-        assert red(state) == []
+    assert red() == red(SignalState.ARROW_STOP) == [(5, 0)]
     early = np.where(np.arange(31) < 5, SignalState.STOP, SignalState.GO)
-    assert red(early) == []
-
-
-def test_a_light_of_another_lane_is_not_the_cars() -> None:
-    """Straight on is green; left and right, from the same stop point, are red."""
-    segment = crossing(1, steps=31)
-    assert len(segment.signal_lane) == 12
-    light = np.full((12, 31), SignalState.STOP, np.uint8)
-    light[0] = SignalState.GO
-    path = np.stack([np.full(31, 1.75), -20 + np.arange(31) * 1.2], -1)
-    segment = segment.replace(
-        position=np.pad(path, ((0, 0), (0, 1)))[None].astype("f4"),
-        heading=np.full((1, 31), np.pi / 2, np.float32),
-        signal_state=light,
-    )
-    assert len(red_lights(world_of(played(segment), 0), np.array([0]), Lanes(segment), 0).step) == 0
+    for state in (SignalState.GO, SignalState.CAUTION, SignalState.FLASHING_STOP, SignalState.UNKNOWN, early):
+        assert red(state) == []
+    # Those of left and right, from the same stop point, are not this car's.
+    assert red(SignalState.GO, SignalState.STOP) == []
 
 
 def test_failed_runs_and_groups_are_told_apart(tmp_path: Path) -> None:
@@ -222,17 +187,15 @@ def test_the_ego_alone_is_evaluated_on_request() -> None:
         rows(played(segment, [1]), "ego")
 
 
-def made_row(group: str, **numbers: Any) -> dict[str, Any]:
-    found = {"segment": group, "group": group, "failed": "", "steps": 10, "logged_steps": 10}
-    return dict.fromkeys(NUMBERS) | found | numbers
-
-
 def test_a_recording_without_a_number_is_no_sample_of_it() -> None:
-    rows = [made_row("a", progress=3.0), made_row("b", progress=None)]
-    totals = total_numbers(rows)
-    assert (totals["progress"], totals["progress_se"]) == (3.0, None)
-    rows.append(made_row("c", progress=5.0))
-    assert (total_numbers(rows)["progress"], total_numbers(rows)["progress_se"]) == (4.0, pytest.approx(1.0))
+    base = dict.fromkeys(NUMBERS) | {"failed": "", "steps": 10, "logged_steps": 10}
+    rows = [
+        base | {"segment": group, "group": group, "progress": x}
+        for group, x in (("a", 3.0), ("b", None), ("c", 5.0))
+    ]
+    for count, expected in ((2, (3.0, None)), (3, (4.0, pytest.approx(1.0)))):
+        totals = total_numbers(rows[:count])
+        assert (totals["progress"], totals["progress_se"]) == expected
 
 
 def test_contacts_are_those_that_the_simulation_flagged() -> None:
@@ -247,61 +210,44 @@ def test_contacts_are_those_that_the_simulation_flagged() -> None:
             assert hit == set(saved.agents[(saved.collision[k] & saved.counted[k]).any(0)].tolist())
 
 
-def report_of_the_log(store: SegmentStore, count: int) -> dict[str, Any]:
-    found = Report("log", "interactive")
+@pytest.mark.parametrize("logs", ["included", pytest.param("real", marks=pytest.mark.samples)])
+def test_logged_driving_breaks_no_rules(logs: str, request: Any, tmp_path: Path) -> None:
+    folder, count = builtin_store("test"), 6
+    if logs == "real":
+        files = sorted((request.getfixturevalue("samples") / "real" / "womd").glob("*.tfrecord"))[:4]
+        if not files:
+            pytest.skip("no real WOMD scenarios among the samples")
+        found = [item for file in files for item in WomdReader().read(file) if isinstance(item, RunSegment)]
+        fill(folder := tmp_path / "store", found)
+        count = len(found)
+    store, told = SegmentStore(folder), Report("log", "interactive")
     for i in range(count):
         scenes = scene(store[i], 2)
-        add_segment(found, saved_rollouts(store[i], scenes, playback(scenes)))
-    return found.totals()
-
-
-def assert_orderly(totals: dict[str, Any]) -> None:
+        add_segment(told, saved_rollouts(store[i], scenes, playback(scenes)))
+    totals = told.totals()
     for name in ("collision_rate", "red_light_rate", "wrong_way_time", "log_distance"):
         assert totals[name] == 0, name
     assert totals["progress_ratio"] == pytest.approx(1)
     assert totals["progress"] > 1
 
 
-def test_logged_driving_breaks_no_rules() -> None:
-    assert_orderly(report_of_the_log(SegmentStore(builtin_store("test")), 6))
-
-
-@pytest.mark.samples
-def test_real_driving_breaks_no_rules(samples: Path, tmp_path: Path) -> None:
-    files = sorted((samples / "real" / "womd").glob("*.tfrecord"))[:4]
-    if not files:
-        pytest.skip("no real WOMD scenarios among the samples")
-    found = [item for file in files for item in WomdReader().read(file)]
-    fill(tmp_path / "store", [item for item in found if isinstance(item, RunSegment)])
-    store = SegmentStore(tmp_path / "store")
-    assert_orderly(report_of_the_log(store, len(store)))
-
-
 def test_moving_and_turning_the_world_changes_nothing() -> None:
     segment = driving((0, 0, 0, 12), (10, 0, 0, 7), (5, LANE_WIDTH, 0, 9))
-    angle, shift = 0.7, np.array([150.0, -80, 0], np.float32)
+    angle, shift, lanes = 0.7, np.array([150.0, -80, 0], np.float32), segment.road.lanes
     turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-
-    def moved(points: Any) -> Any:
-        return (points @ turn + shift).astype(np.float32)
-
-    road = dataclasses.replace(
-        segment.road, lanes=Polylines(moved(segment.road.lanes.points), segment.road.lanes.offsets)
-    )
+    moved = Polylines((lanes.points @ turn + shift).astype(np.float32), lanes.offsets)
     other = segment.replace(
-        position=moved(segment.position),
+        position=(segment.position @ turn + shift).astype(np.float32),
         heading=segment.heading + np.float32(angle),
         velocity=(segment.velocity @ turn[:2, :2]).astype(np.float32),
-        road=road,
+        road=dataclasses.replace(segment.road, lanes=moved),
     )
-    one, two = rows(played(segment, [0, 1]))[0], rows(played(other, [0, 1]))[0]
+    one, two = (rows(played(each, [0, 1]))[0] for each in (segment, other))
     for name, value in one.items():
         assert two[name] == (pytest.approx(value, abs=2e-2) if isinstance(value, float) else value), name
 
 
-def test_the_command_writes_page_numbers_and_table(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_page_numbers_and_table(tmp_path: Path, capsys: Any) -> None:
     hit = driving((0, 0, 0, 12), (10, 0, 0, 7), segment_id="a&b <i>")
     types = np.array([AgentType.VEHICLE, AgentType.CYCLIST], np.uint8)
     free = driving((0, 0, 0, 7), (10, 0, 0, 7), segment_id="free", agent_type=types)

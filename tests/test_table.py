@@ -1,11 +1,11 @@
-"""The paper's tables made of kept evaluations, and the figure of curvature."""
+"""The paper's tables made of kept evaluations, which of these count, and the figure of curvature."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +14,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers_runs import tiny
 from helpers_segments import crossing, straight_road
-from helpers_table import METHODS, full_table, make_entry, row_of
+from helpers_store import fill
+from helpers_table import METHODS, full_table, make_entry, make_record, make_run, row_of
 from symphony.cli import main
-from symphony.config import AgentConfig, EvaluateConfig, TrainConfig
+from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
-from symphony.data.store_writer import StoreWriter
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
-from symphony.evaluation.records import evaluation_name, kept_evaluations
+from symphony.evaluation.records import evaluation_name, find_runs, keep_evaluation, kept_evaluations
 from symphony.evaluation.table import (
     COLUMNS,
     METRICS,
     ROWS,
     Entry,
+    collect,
     compare,
     paper_figures,
     table_text,
@@ -64,16 +66,16 @@ def test_the_lowest_value_of_each_family_is_the_best(table: dict[str, tuple[floa
     entries = [make_entry(method, **dict(zip(METRICS, row, strict=True))) for method, row in table.items()]
     found = compare(entries, "main")
     for number, key in enumerate(METRICS):
-        for name in ("bc", "mgail"):
-            mine = {
-                method: COLUMNS[key].shown(row[number])
-                for method, row in table.items()
-                if method.startswith(name)
-            }
-            best = {method for method in mine if row_of(found, method)[key]["best"]}
-            least = min(mine.values(), key=float) if len(mine) > 1 else None
-            assert best == {method for method, shown in mine.items() if shown == least}
         assert not row_of(found, "playback")[key]["best"]
+        for family in ("bc", "mgail"):
+            mine = {
+                name: COLUMNS[key].shown(row[number])
+                for name, row in table.items()
+                if name.startswith(family)
+            }
+            least = min(mine.values(), key=float) if len(mine) > 1 else None
+            for method, shown in mine.items():
+                assert row_of(found, method)[key]["best"] == (shown == least)
 
 
 def test_rows_are_those_of_the_paper_and_missing_methods_are_missing() -> None:
@@ -82,14 +84,10 @@ def test_rows_are_those_of_the_paper_and_missing_methods_are_missing() -> None:
     assert " ".join(row["name"] for row in rows[2:]) == (
         "BC BC+H BC+TS BC+TS+H MGAIL MGAIL+H MGAIL+TS MGAIL+TS+H"
     )
+    assert [rows[0][key]["mean"] for key in METRICS[:2]] == [0.5, 0.25]
+    assert all(math.isnan(rows[0][key]["mean"]) for key in METRICS[2:])  # playback has no distance to itself
     some = compare(full_table(2, ("mgail_ts", "bc_h")), "main", "proprietary")
     assert [row["method"] for row in some["rows"]] == ["playback", "constant_velocity", "bc_h", "mgail_ts"]
-
-
-def test_playback_has_no_distance_to_itself() -> None:
-    row = row_of(compare(full_table(), "main"), "playback")
-    assert [row[key]["mean"] for key in METRICS[:2]] == [0.5, 0.25]
-    assert all(math.isnan(row[key]["mean"]) for key in METRICS[2:])
 
 
 def test_a_mean_over_something_unknown_is_unknown_and_never_the_best() -> None:
@@ -201,34 +199,17 @@ def test_the_text_reads_back(seeds: int, dataset: Any) -> None:
     assert [line[1] for line in lines[4:]] == [str(seeds)] * 8
 
 
-def test_json_reads_back_whole() -> None:
-    table = compare(full_table(3), "many", "proprietary")
-    read = json.loads(json_text(table))
-    assert (read["setting"], read["interactive"], read["duration"]) == ("many", 8, 10)
-    assert read["rows"][2:] == table["rows"][2:]  # those of baselines have no error
-
-
 # --- the commands ---
 
 
-@pytest.fixture(scope="module")
-def evaluated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A tiny run, and a store to evaluate it on."""
-    folder = tmp_path_factory.mktemp("table")
-    store = folder / "test"
-    with StoreWriter(store) as writer:
-        writer.append(straight_road(4, seed=1, steps=8))
-        writer.append(crossing(4, seed=1, steps=8))
-    agent, out = AgentConfig(hidden=8, num_points=10), folder / "bc"
-    config = TrainConfig(method="bc", data=store, out=out, steps=2, agent=agent, states=8, wandb="disabled")
-    return train(config), store
-
-
 def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(
-    evaluated: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: Any, capsys: Any
 ) -> None:
-    run, store = tmp_path / "bc", evaluated[1]
-    shutil.copytree(evaluated[0], run)
+    store = tmp_path / "test"
+    fill(store, [straight_road(4, seed=1, steps=8), crossing(4, seed=1, steps=8)])
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    run = train(tiny("bc", store, tmp_path / "bc", steps=2))
     file = tmp_path / "numbers.json"
     command = ["evaluate", str(run), "--data", str(store), "--rollouts", "2"]
     assert main([*command, "--no-keep", "--json", str(file)]) == 0
@@ -240,8 +221,7 @@ def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(
     assert record | {"cost": 0} == other | {"cost": 0}
     assert other["cost"]["simulation"] > 0
     assert name == evaluation_name(record)
-    found = evaluate(str(run), store, EvaluateConfig(rollouts=2))
-    assert record["ade"] == found.numbers()["ade"]
+    assert record["ade"] == evaluate(str(run), store, EvaluateConfig(rollouts=2)).numbers()["ade"]
     assert record["playback"]["ade"] == 0
     assert len(record["per_segment"]) == 2
     segments = SegmentStore(store)
@@ -269,15 +249,10 @@ def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(
         assert "--evaluation" in capsys.readouterr().err
         assert main([*again, "--evaluation", "*-seed5"]) == 0
     assert not list((run / "evaluations").glob(".*"))
-
-
-def test_baselines_leave_nothing_behind(
-    evaluated: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("playback", "constant_velocity"):
-        assert main(["evaluate", name, "--data", str(evaluated[1]), "--rollouts", "1"]) == 0
-    assert not list(tmp_path.iterdir())
+    # Baselines leave nothing behind.
+    for agent in ("playback", "constant_velocity"):
+        assert main(["evaluate", agent, *command[2:]]) == 0
+    assert not list(Path().iterdir())
 
 
 # --- the figure ---
@@ -286,15 +261,181 @@ def test_baselines_leave_nothing_behind(
 @given(st.lists(st.integers(0, 50), min_size=41, max_size=41).filter(any), st.integers(2, 9))
 @settings(max_examples=4)
 def test_bars_are_shares_of_all_visits(tmp_path_factory: Any, counts: list[int], times: int) -> None:
-    path = tmp_path_factory.mktemp("figure") / "curvature.svg"
     policy, log = np.array(counts), np.array(counts[::-1]) * times
-    (axes,) = plot_curvature({"BC": (policy, log)}, path).axes
+    (axes,) = plot_curvature({"BC": (policy, log)}, tmp_path_factory.mktemp("figure") / "curvature.svg").axes
     drawn = {patch.get_gid(): patch.get_data() for patch in axes.patches}
     assert drawn["policy"].values == pytest.approx(policy / policy.sum())
     assert drawn["log"].values == pytest.approx(drawn["policy"].values[::-1])
     centres = (drawn["log"].edges[1:] + drawn["log"].edges[:-1]) / 2
     assert centres == pytest.approx(np.linspace(-1, 1, 41))
     left, right = axes.get_xlim()
-    assert left < centres[policy > 0].min()
-    assert right > centres[policy > 0].max()
-    assert axes.get_ylim()[1] > max(drawn["policy"].values.max(), drawn["log"].values.max())
+    assert left < centres[policy > 0].min() < centres[policy > 0].max() + 1e-9 < right
+    assert axes.get_ylim()[1] > max(part.values.max() for part in drawn.values())
+
+
+# --- which runs and evaluations count, and what evaluations are called ---
+
+CHANGES: dict[str, Any] = {
+    "persona": "speed=.8", "rollouts": 8, "search": "backtrack", "score": "rule", "trees": 2, "branches": 8,
+    "rule": "systematic", "logged_goals": True, "seed": 1, "duration": 20, "interactive": 8, "prune_every": 2,
+    "temperature": 0.6, "threshold": 2.0, "goals": "branch", "metric": ["my.metrics:jerk"], "action_temperature": 0.5,
+    "radius": 50.0, "open_traffic": True, "others": "idm",
+}  # fmt: skip
+TREE = {"search": "tree", "trees": 1, "branches": 16, "rule": "best"}
+
+
+def test_names_differ_with_everything_that_changes_results() -> None:
+    same = {"batch", "device", "workers", "engine"}
+    assert {field.name for field in dataclasses.fields(EvaluateConfig)} == CHANGES.keys() | same
+    base = make_record(**TREE)
+    others = [base | {"config": base["config"] | {name: value}} for name, value in CHANGES.items()]
+    others.append(base | {"data": {"name": "test", "checksum": "cd" * 32}})
+    others.append(base | {"run": {"named": True, "checkpoint": 50}})
+    names = [evaluation_name(record) for record in (base, *others)]
+    assert len(set(names)) == len(names)
+    changes = {"batch": 3, "device": "cuda", "workers": 2, "engine": "ray"}
+    assert evaluation_name(others[0] | {"config": others[0]["config"] | changes}) == names[1]
+    # Included agents keep evaluations by such names.
+    replace = make_record(**TREE | {"rule": "replace", "prune_every": 2, "threshold": 1.0, "goals": "branch"})
+    wanted = "test-abababababab-tree-1x16-replace-every2-2agents-16rollouts-seed0-threshold=1.0-goals=branch"
+    assert evaluation_name(replace) == wanted
+
+
+@settings(max_examples=20)
+@given(st.text(max_size=80), st.integers(0, 9))
+def test_names_are_file_names_and_differ_however_long_they_are(store: str, paths: int) -> None:
+    """An evaluation of hours was lost where its name was too long for a file."""
+    metric = [f"measures.of.comfort.{part}:{part}_of_all_agents" for part in range(paths)]
+    records = (make_record(metric=[*metric, last]) for last in ("x:y", "x:z"))
+    names = {evaluation_name(record | {"data": {"name": store, "checksum": "ab" * 32}}) for record in records}
+    assert len(names) == 2
+    assert all(re.fullmatch(r"[A-Za-z0-9._-]{1,200}", name) for name in names)
+
+
+def test_settings_tell_runs_apart(tmp_path: Path) -> None:
+    """What was evaluated in another setting than its run's own does not count."""
+    eight: dict[str, Any] = {"agent": {"interactive": 8}}
+    kinds: dict[Any, list[dict[str, Any]]] = {
+        "main": [{}, {"duration": 0}, {"duration": 10}, {"agent": {}}], "long": [{"duration": 20}], "many": [eight],
+        "strange": [{"duration": 15}, {"duration": 20} | eight],
+    }  # fmt: skip
+    for setting, configs in kinds.items():
+        for k, config in enumerate(configs):
+            agents = config.get("agent", {}).get("interactive", 2)
+            record = make_record(interactive=agents, duration=config.get("duration", 0))
+            make_run(tmp_path / f"{setting}-{k}", "bc", k, record, **config)
+    make_run(tmp_path / "new", "bc", 9)
+    make_run(tmp_path / "other", "bc", 8, make_record(interactive=8), make_record(duration=20))
+    for setting in ("main", "long", "many"):
+        entries, left_out = collect([tmp_path], setting)
+        assert [entry.folder.name for entry in entries] == [
+            f"{setting}-{k}" for k in range(len(kinds[setting]))
+        ]
+        assert len(entries) + sum(map(len, left_out.values())) == 10
+    assert any("not evaluated" in reason for reason in collect([tmp_path], "main")[1])
+    keep_evaluation(str(tmp_path / "other"), make_record(duration=10))
+    assert len(collect([tmp_path / "other"], "main")[0]) == 1
+
+
+def test_whole_logs_count_by_how_long_they_are(tmp_path: Path) -> None:
+    horizons = {"waymo": (9.0, 0), "town": (10.0, 0), "long": (20.0, 0)}
+    horizons["part"] = 20.0, 20  # trained on the whole of the segments, whatever that is
+    for seed, (name, (seconds, duration)) in enumerate(horizons.items()):
+        make_run(tmp_path / name, "bc", seed, make_record(duration=duration) | {"horizon": seconds})
+    found = {name: collect([tmp_path], name)[0] for name in ("main", "long", "many")}
+    names = {name: [entry.folder.name for entry in entries] for name, entries in found.items()}
+    assert names == {"main": ["town", "waymo"], "long": ["long"], "many": []}
+    assert "rollouts last 9 or 10 s" in compare(found["main"], "main")["notes"]
+    assert "rollouts last" not in table_text(compare(found["long"], "long"))
+
+
+def test_runs_are_found_below_folders_each_once(tmp_path: Path) -> None:
+    one = make_run(tmp_path / "a" / "one", "bc")
+    two = make_run(tmp_path / "a" / "deeper" / "two", "bc", 1)
+    (one / "checkpoints" / "inner").mkdir(parents=True)
+    (one / "checkpoints" / "inner" / "config.json").write_text("{}")
+    assert sorted(find_runs([tmp_path, one, tmp_path / "a", two])) == sorted([one, two])
+    (tmp_path / "empty").mkdir()
+    for folder in (tmp_path / "empty", tmp_path / "absent"):
+        with pytest.raises(ConfigError, match="holds no run"):
+            find_runs([one, folder])
+
+
+def test_each_way_to_simulate_has_a_row_and_its_cost(tmp_path: Path) -> None:
+    forest = make_record(**TREE | {"trees": 16, "branches": 4}) | {"cost": {"simulation": 24.0}}
+    tree, without = make_record(**TREE, goals="branch"), make_record()
+    make_run(tmp_path / "ts", "bc_ts", 0, forest, tree)
+    make_run(tmp_path / "bc", "bc", 0, without)
+    table = compare(collect([tmp_path], "main")[0], "main")
+    cost = {row["name"]: row["cost"]["mean"] for row in table["rows"][2:]}
+    assert cost == {"BC": 1.5, "BC+TS tree-16x4-best": 6.0, "BC+TS tree-1x16-best-goals=branch": 1.5}
+    assert all(name in table_text(table) for name in cost)
+    for patterns, wanted in (
+        (["*-1x16-*", "*-none-*"], {"bc_ts": tree, "bc": without}),
+        (["*-none-*", "*-16x4-*"], {"bc_ts": forest, "bc": without}),
+        ([evaluation_name(tree)], {"bc_ts": tree}),
+    ):
+        found = {entry.method: entry.record for entry in collect([tmp_path], "main", patterns)[0]}
+        assert found == wanted
+    entries, left_out = collect([tmp_path], "main", ["*-oracle-*"])
+    assert not entries
+    assert list(map(len, left_out.values())) == [2]
+
+
+def test_two_evaluations_of_one_row_and_seed_need_a_choice(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "one", "bc_h", 3, make_record(), make_record(seed=3))
+    with pytest.raises(ConfigError, match=r"BC\+H with seed 3 was simulated twice as none.*--evaluation"):
+        collect([run], "main")
+    assert len(collect([run], "main", ["*-seed3"])[0]) == 1
+    make_run(tmp_path / "two", "bc_h", 3, make_record(seed=3))
+    with pytest.raises(ConfigError, match=r"twice as none.*one.*two"):
+        collect([tmp_path], "main", ["*-seed3"])
+
+
+def test_rows_must_be_comparable() -> None:
+    entries = full_table(2)
+    entries[-1].record["data"]["checksum"] = "cd" * 32
+    with pytest.raises(ConfigError, match="different run segments"):
+        compare(entries, "main")
+    entries = full_table(2)
+    entries[-1].record["config"]["rollouts"] = 4
+    with pytest.raises(ConfigError, match=r"seeds of MGAIL\+TS\+H evaluated in different ways"):
+        compare(entries, "main")
+    entries[-2].record["config"]["rollouts"] = 4
+    assert any("4 rollouts: MGAIL+TS+H" in note for note in compare(entries, "main")["notes"])
+    with pytest.raises(ConfigError, match="no evaluated runs"):
+        compare([], "main")
+    with pytest.raises(DataError, match="ade"):
+        compare([make_entry("bc", ade="much")], "main")  # type: ignore[arg-type]
+
+
+def test_notes_say_what_differs_and_what_is_outdated(tmp_path: Path) -> None:
+    for seed, steps in ((0, 5), (1, 6)):
+        record = make_record(seed=seed)
+        record["run"] |= {"updates": 5, "named": bool(seed), "checkpoint": 3}
+        run = make_run(tmp_path / f"bc-{seed}", "bc", seed, record, steps=steps, out=str(seed))
+        (checkpoint := run / "checkpoints" / f"step-{steps:012d}").mkdir(parents=True)
+        (checkpoint / "checkpoint.json").write_text("{}")
+    notes = "\n".join(compare(collect([tmp_path], "main")[0], "main")["notes"])
+    assert "runs of BC differ in steps\n" in notes
+    for told, words in (
+        ("was evaluated after", "5 updates and has 6 now"),
+        ("was evaluated at checkpoint", "3, not its own"),
+    ):
+        assert notes.count(told) == 1
+        assert f"bc-1 {told} {words}" in notes
+
+
+WRONG = {"{": "not valid JSON", "[]": "not a JSON object", "{}": "format"}
+WRONG |= {
+    json.dumps(make_record() | {"format": 99}): "format 99",
+    json.dumps(make_record() | {"run": None}): "field run",
+}
+
+
+@pytest.mark.parametrize("text", WRONG, ids=WRONG.values())
+def test_damaged_evaluations_are_named(tmp_path: Path, text: str) -> None:
+    run = make_run(tmp_path / "bc", "bc", 0, make_record())
+    (run / "evaluations" / "bad.json").write_text(text)
+    with pytest.raises(DataError, match=rf"bad\.json.*{WRONG[text]}"):
+        collect([run], "main")
