@@ -111,24 +111,14 @@ def assert_same(first: TensorDictBase, second: TensorDictBase) -> None:
 
 
 class Mass(EnvBase):
-    """Points x' = x + 0.5 (v + action), whose episode is over beyond a limit; they can come back in.
+    """Points x' = x + 0.5 (v + action), whose episode is over beyond a limit; they can come back in, if not sticky.
 
-    Args:
-        batch_size: of the environment itself.
-        agents: None for one point; else N, which end apart.
-        sticky: an episode that is over stays so.
+    There is one point, or so many agents, which end apart.
     """
 
     batch_locked = False
 
-    def __init__(
-        self,
-        batch_size: tuple[int, ...] = (),
-        agents: int | None = None,
-        *,
-        sticky: bool = False,
-        limit: float = 1.5,
-    ) -> None:
+    def __init__(self, batch_size: Any = (), agents: int | None = None, *, sticky=False, limit=1.5) -> None:
         super().__init__(batch_size=torch.Size(batch_size))
         self.sticky, self.limit = sticky, limit
         self.group = None if agents is None else "agents"

@@ -3,13 +3,6 @@
 Inside :func:`pretend` tensors have shapes, types and devices but no numbers. PyTorch itself refuses to mix devices
 and to read a number; copies between device and host, which would wait for the device, are noted here. Constants that
 the package makes once per device are counted apart.
-
-    env = DrivingEnv(...)  # on the host, with numbers
-    with pretend() as device:
-        on(device, env)
-        ...
-    assert not device.waits
-    assert device.constants < 10
 """
 
 from __future__ import annotations
@@ -47,13 +40,7 @@ if torch.cuda.is_available():
 
 
 class PretendDevice:
-    """A device without numbers.
-
-    Attributes:
-        device: for tensors made inside.
-        waits: copies between it and the host so far, as text.
-        constants: how many were made for it so far.
-    """
+    """A device without numbers: copies between it and the host so far, as text, and how many constants were made."""
 
     def __init__(self) -> None:
         self.device = torch.device(NAME, 0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from random import Random
 from typing import Any
 
 import pytest
@@ -46,9 +45,7 @@ def far(state: TensorDictBase) -> Tensor:
 RULE = Backtrack(0.0, renew=other_numbers)
 
 
-def look(
-    start: TensorDictBase, rule: Any = RULE, *, score: Any = far, steps: int = 12, every: int = 2, **how: Any
-) -> BeamSearchResult:
+def look(start, rule=RULE, *, score=far, steps=12, every=2, **how):
     return beam_search(Walk(), Policy(), score, start, steps=steps, prune_every=every, rule=rule, **how)
 
 
@@ -61,7 +58,7 @@ def assert_same_search(first: BeamSearchResult, second: BeamSearchResult) -> Non
 
 @given(st.integers(1, 3), st.integers(1, 4), st.integers(1, 9), st.integers(1, 5))
 @settings(deadline=None, max_examples=8)
-def test_what_is_never_bad_is_independent(rows: int, branches: int, steps: int, every: int) -> None:
+def test_what_is_never_bad_is_independent(rows, branches, steps, every):
     start = starts(Walk(), rows, branches=branches)
     found = look(start, replace(RULE, threshold=math.inf), steps=steps, every=every)
     assert_same_search(found, look(start, KeepAll(), steps=steps, every=every))
@@ -69,7 +66,7 @@ def test_what_is_never_bad_is_independent(rows: int, branches: int, steps: int, 
 
 
 @pytest.mark.parametrize("keep", [None, [*STATE, *OUTCOME]], ids=["all kept", "rebuilt"])
-def test_a_rule_that_can_be_met_is_met(keep: Any) -> None:
+def test_a_rule_that_can_be_met_is_met(keep):
     start = starts(Walk(), 5, branches=4)
     start.set(X, 0.3 * start.get(X))  # or some begin where the first step is bad, whatever is drawn
     rule = replace(RULE, back=(1, 2, 3, 0), cap=100, renew=rebuilt if keep else other_numbers)
@@ -87,7 +84,7 @@ def test_a_rule_that_can_be_met_is_met(keep: Any) -> None:
 
 @given(st.integers(1, 9), st.sampled_from([(3, 11), (4, 8)]), st.randoms(use_true_random=False))
 @settings(deadline=None, max_examples=3)
-def test_lines_know_nothing_of_each_other(width: int, periods: tuple[int, int], random: Random) -> None:
+def test_lines_know_nothing_of_each_other(width, periods, random):
     every, steps = periods
     start, rule = starts(Walk(), 4, branches=2), replace(RULE, cap=2.0)
     whole = look(start, rule, every=every, steps=steps)
@@ -98,7 +95,7 @@ def test_lines_know_nothing_of_each_other(width: int, periods: tuple[int, int], 
     assert torch.equal(part.totals, whole.totals[rows])
 
 
-def test_lines_are_true_histories() -> None:
+def test_lines_are_true_histories():
     start = starts(Walk(), 6, branches=3)
     found, env, policy = look(start, steps=11), Walk(), Policy()
     assert found.simulated_steps > 1.2 * 6 * 3 * 11
@@ -117,7 +114,7 @@ def test_lines_are_true_histories() -> None:
 
 def course(rule: Backtrack, bad: Any) -> tuple[list[tuple[int, int]], int]:
     """Where a line of 20 steps goes back to with which tries, and how many steps are simulated."""
-    places: list[tuple[int, int]] = []
+    places = []
 
     def noted(state: TensorDictBase, attempt: Tensor) -> TensorDictBase:
         places.append((int(state.get("step")), int(attempt)))
@@ -131,7 +128,7 @@ def course(rule: Backtrack, bad: Any) -> tuple[list[tuple[int, int]], int]:
     return places, found.simulated_steps
 
 
-def test_the_course_of_a_line() -> None:
+def test_the_course_of_a_line():
     """One step is bad, always: a little back, farther, to the start, again to the start, and on at last."""
     places, simulated = course(Backtrack(0.0, (1, 3, 0), cap=2), lambda step, tries: step == 9)
     # 1 + 3 + 5 + 5 + 5 + 5 of 10 periods are more than twice a line.
@@ -141,7 +138,7 @@ def test_the_course_of_a_line() -> None:
     assert places == [(8, 1), (4, 2), (0, 3)]
 
 
-def test_once_past_its_trouble_a_line_counts_anew() -> None:
+def test_once_past_its_trouble_a_line_counts_anew():
     def bad(step: Tensor, tries: int) -> Tensor:
         """At the first visit of three places, as far as they are told by the numbers of the line."""
         return step == {0: 6, 1: 12, 2: 14}.get(tries, -1)
@@ -151,7 +148,7 @@ def test_once_past_its_trouble_a_line_counts_anew() -> None:
 
 
 @pytest.mark.parametrize("cap", [0.0, 3.0])
-def test_what_cannot_be_met_ends(cap: float) -> None:
+def test_what_cannot_be_met_ends(cap):
     start, plain = starts(Walk(), 3, branches=2), 3 * 2 * 12
     rule = replace(RULE, back=(1, 0), cap=cap)
     found = look(start, rule, score=lambda state: (distance(state) > -1).float())
@@ -164,7 +161,7 @@ def test_what_cannot_be_met_ends(cap: float) -> None:
     assert look(start, score=lambda state: distance(state) * math.nan).simulated_steps > plain
 
 
-def test_what_can_not_be_right_is_refused() -> None:
+def test_what_can_not_be_right_is_refused():
     start = starts(Walk(), 2, branches=2)
     with pytest.raises(ValueError, match=r"their kept states have no .*'x'"):
         look(start, keep=[STREAM, *OUTCOME])
@@ -177,7 +174,7 @@ def test_what_can_not_be_right_is_refused() -> None:
         Backtrack(math.nan)
 
 
-def test_as_a_collector() -> None:
+def test_as_a_collector():
     frames = 3 * 4 * 10
     collector = BeamSearchCollector(
         *(with_rows(Walk(), [3]), Policy()),

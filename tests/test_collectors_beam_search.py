@@ -11,19 +11,8 @@ from tensordict.nn import TensorDictModule
 from torch.testing import assert_close
 from torchrl.envs import ParallelEnv, PendulumEnv, SerialEnv, StepCounter, TransformedEnv
 
-from helpers_collectors import ACTION, LOG_PROB, STREAM, Policy, Walk, X, assert_same, distance, noise, starts
-from symphony.collectors import (
-    Aggregate,
-    KeepAll,
-    KeyScore,
-    ReplaceBad,
-    Systematic,
-    beam_search,
-    branch,
-    check_branching,
-    max_then_sum,
-    mean_then_sum,
-)
+from helpers_collectors import ACTION, LOG_PROB, STREAM, Policy, Walk, X, assert_same, distance, starts
+from symphony import collectors
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +23,7 @@ def no_gradients():
 
 def search(start, *, env=None, policy=None, score=distance, steps=12, prune_every=4, **kwargs):
     how = {"slot_keys": [STREAM], **kwargs}
-    return beam_search(
+    return collectors.beam_search(
         env or Walk(), policy or Policy(), score, start, steps=steps, prune_every=prune_every, **how
     )
 
@@ -104,7 +93,10 @@ def test_rows_never_meet():
         assert_same(alone.trajectories, flat.trajectories[row])
         assert_close(alone.scores, flat.scores[row], rtol=0, atol=0)
     rows = Walk().reset(TensorDict({}, [3]))  # views of one row will do for a start
-    assert_same(search(branch(rows, 4)).trajectories, search(branch(rows, 4).clone()).trajectories)
+    assert_same(
+        search(collectors.branch(rows, 4)).trajectories,
+        search(collectors.branch(rows, 4).clone()).trajectories,
+    )
 
 
 def test_copies_draw_numbers_of_their_slot():
@@ -119,28 +111,6 @@ def test_copies_draw_numbers_of_their_slot():
     alike, stream = twins()
     assert not alike
     assert_close(stream, start.get(STREAM))
-
-
-def test_gradient_follows_the_survivors():
-    env, policy = Walk(), Policy()
-    start = starts(env, 3, branches=4)
-    with torch.enable_grad():
-        root = start.get(X).clone().requires_grad_()
-        found = search(start.clone().set(X, root), env=env, policy=policy)
-        end = found.trajectories.get(("next", *X))[:, :, -1].square().sum()
-        gain, at_root = torch.autograd.grad(end, [policy.gain, root], retain_graph=True)
-        scored = torch.autograd.grad(end + found.totals.sum(), policy.gain)[0]
-        assert scored != gain  # scores carry a gradient, too
-        origin = found.slots[:, 0]
-        x = root.gather(1, origin[..., None, None].expand(3, 4, 2, 1))
-        drawn = noise(found.trajectories, 2)
-        for step in range(12):
-            x = x + policy.gain * x + drawn[:, :, step] + 0.1 * x.sin()
-        by_hand = torch.autograd.grad(x.square().sum(), [policy.gain, root])
-    assert_close((gain, at_root), by_hand)
-    reached = torch.zeros(3, 4, dtype=torch.bool).scatter(1, origin, True)
-    assert not reached.all()
-    assert torch.equal(at_root.ne(0).any(-1).any(-1), reached)
 
 
 class Counting(Walk):
@@ -182,7 +152,6 @@ def test_what_remembers_can_not_be_branched(env, why):
 
 @pytest.mark.parametrize("kind", [Drawing, Walk, PendulumEnv])
 def test_random_numbers_are_no_memory(kind):
-    """Nor does looking for it cost any."""
     env = kind()
     if isinstance(env, PendulumEnv):
         state, own = env.reset(env.gen_params(batch_size=[3]), set_state=False), None
@@ -190,7 +159,7 @@ def test_random_numbers_are_no_memory(kind):
         state, own = starts(env, 3, branches=1), env.rng.get_state()
     before = state.clone()
     torch.manual_seed(5)
-    check_branching(env, state)
+    collectors.check_branching(env, state)
     assert_same(state, before)
     drawn = torch.rand(3)
     torch.manual_seed(5)
@@ -205,7 +174,9 @@ def test_marks_of_the_tree():
     for row, leaf, step in itertools.product(range(3), range(4), range(12)):
         slot = found.slots[row, step // 4, leaf]
         assert_same(found.tree[row, slot, step], found.trajectories[row, leaf, step])
-    assert_close(found.leaf_totals, max_then_sum(found.scores.unflatten(2, (3, 4)).transpose(1, 2)))
+    assert_close(
+        found.leaf_totals, collectors.max_then_sum(found.scores.unflatten(2, (3, 4)).transpose(1, 2))
+    )
 
 
 def test_leaves_are_the_best_and_distinct():
@@ -215,7 +186,10 @@ def test_leaves_are_the_best_and_distinct():
     assert_same(best.trajectories, whole.trajectories[:, :4])
     assert_close(best.slots, whole.slots[..., :4])
     assert_close(best.scores, whole.scores[:, :4])
-    free, chosen = search(start, rule=KeepAll()), search(start, rule=KeepAll(), leaves=6)
+    free, chosen = (
+        search(start, rule=collectors.KeepAll()),
+        search(start, rule=collectors.KeepAll(), leaves=6),
+    )
     assert torch.equal(chosen.slots[:, 0], free.totals[:, -1].argsort(-1))
 
 
@@ -224,7 +198,9 @@ def test_a_rule_may_mix_groups():
     generator, key = torch.Generator().manual_seed(0), ("agents", "goal")
     goals = torch.randint(3, (3, 6, 2), generator=generator)
     start = starts(Walk(), 3, branches=6).set(key, goals)
-    found = search(start, rule=ReplaceBad(2.0), group_key=key, noise=torch.rand(3, 3, generator=generator))
+    found = search(
+        start, rule=collectors.ReplaceBad(2.0), group_key=key, noise=torch.rand(3, 3, generator=generator)
+    )
     groups, mixed = goals, 0
     for parents, totals in zip(found.parents.unbind(1), found.totals.unbind(1), strict=True):
         after = groups.gather(1, parents[..., None].expand(3, 6, 2))
@@ -255,12 +231,12 @@ def test_only_what_is_kept_comes_back():
 
 def test_scores_without_agents_of_the_reward_and_of_a_module():
     start = starts(Walk(), 2, branches=4)
-    one = search(start, score=lambda td: distance(td).sum(-1), aggregate=mean_then_sum)
+    one = search(start, score=lambda td: distance(td).sum(-1), aggregate=collectors.mean_then_sum)
     assert one.scores.shape == (2, 4, 12, 1)
-    plain, reward = search(start), search(start, score=KeyScore(("agents", "reward"), negate=True))
+    plain, reward = search(start), search(start, score=collectors.KeyScore(("agents", "reward"), negate=True))
     assert_close(reward.scores, plain.scores)
     module = TensorDictModule(lambda x: x.abs(), in_keys=[X], out_keys=[("agents", "score")])
-    written = search(start, score=KeyScore(("agents", "score"), module))
+    written = search(start, score=collectors.KeyScore(("agents", "score"), module))
     for found in (reward, written):  # scores leave no trace
         assert set(found.trajectories.keys(True, True)) == set(plain.trajectories.keys(True, True))
 
@@ -269,25 +245,27 @@ def test_scores_of_any_usual_shape_become_one_number_per_agent():
     """Of three branches: without agents, with one or two, and with a last dimension as TorchRL's rewards have it."""
     for shape in ((3,), (3, 1), (3, 2), (3, 1, 1), (3, 2, 1)):
         values = torch.rand(5, *shape)
-        assert torch.equal(KeyScore("score")(TensorDict({"score": values}, [5, 3])), values.reshape(5, 3, -1))
+        assert torch.equal(
+            collectors.KeyScore("score")(TensorDict({"score": values}, [5, 3])), values.reshape(5, 3, -1)
+        )
     td = TensorDict({"score": torch.tensor([[1.0, torch.nan]]), "valid": torch.tensor([[True, False]])}, [1])
-    assert KeyScore("score", valid_key="valid")(td).tolist() == [[1.0, 0.0]]
+    assert collectors.KeyScore("score", valid_key="valid")(td).tolist() == [[1.0, 0.0]]
     with pytest.raises(KeyError, match="absent"):
-        KeyScore("score", valid_key="absent")(td)
+        collectors.KeyScore("score", valid_key="absent")(td)
     # A score of the whole branch would count once for each agent, another mask for other agents.
     for shape in ((1,), (1, 1), (1, 3)):
         with pytest.raises(ValueError, match="'valid' is"):
-            KeyScore("one", valid_key="valid")(td.clone().set("one", torch.ones(shape)))
+            collectors.KeyScore("one", valid_key="valid")(td.clone().set("one", torch.ones(shape)))
 
 
 def test_aggregates_by_hand():
     scores = torch.tensor([[[[1.0, 5.0], [3.0, 0.0], [2.0, 1.0]]]])
     wanted = {("max", "sum"): 8.0, ("mean", "sum"): 4.0, ("sum", "max"): 6.0, ("last", "mean"): 1.5}
     for (time, agents), total in wanted.items():
-        assert Aggregate(time, agents)(scores).tolist() == [[total]]
+        assert collectors.Aggregate(time, agents)(scores).tolist() == [[total]]
     for wrong in (("median", "sum"), ("max", "last")):
         with pytest.raises(ValueError, match="is one of"):
-            Aggregate(*wrong)
+            collectors.Aggregate(*wrong)
 
 
 @pytest.mark.parametrize(
@@ -297,10 +275,10 @@ def test_aggregates_by_hand():
         ({"prune_every": 0}, "positive"),
         ({"leaves": 5}, "leaves"),
         ({"group_key": STREAM}, "takes groups"),
-        ({"group_key": "goal", "rule": ReplaceBad(0.0)}, "goal"),
-        ({"group_key": X, "rule": ReplaceBad(0.0)}, "integers, one or some per branch"),
+        ({"group_key": "goal", "rule": collectors.ReplaceBad(0.0)}, "goal"),
+        ({"group_key": X, "rule": collectors.ReplaceBad(0.0)}, "integers, one or some per branch"),
         ({"noise": torch.zeros(2, 2)}, "noise"),
-        ({"rule": Systematic(1.0)}, "noise"),
+        ({"rule": collectors.Systematic(1.0)}, "noise"),
         ({"rule": lambda totals, noise: totals}, "int64"),
         ({"rule": lambda totals, noise: 1 / 0}, "ZeroDivisionError: division by zero"),
         ({"rule": lambda totals, noise: totals.argsort(-1)[:, :2]}, "int64"),

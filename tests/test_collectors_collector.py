@@ -1,52 +1,43 @@
-"""The collector, by what TorchRL's own tests ask of one."""
+"""The collector: what TorchRL's own tests ask of one, its work in processes, and what it needs of TorchRL."""
 
 from __future__ import annotations
 
+import ast
 import functools
+import inspect
 import pickle
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import nn
 from torch.testing import assert_close
-from torchrl.collectors import Collector
+from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
-from torchrl.envs import EnvBase, PendulumEnv
+from torchrl.envs import PendulumEnv
 
+import symphony.collectors
 from helpers_collectors import ACTION, STREAM, Policy, Walk, X, assert_same, distance, give_streams
-from symphony.collectors import (
-    BeamSearchCollector,
-    KeyScore,
-    Systematic,
-    with_rows,
-)
+from symphony.collectors import BeamSearchCollector, KeyScore, Systematic, with_rows
 
-ROWS, STEPS, FRAMES = 3, 8, 3 * 8
+ROWS, STEPS, FRAMES, WORKERS = 3, 8, 3 * 8, 2
+SEARCH = {"branches": 4, "prune_every": 4, "prepare": give_streams, "slot_keys": [STREAM]}
+PLAIN = {"auto_register_policy_transforms": False}
+ROOM = Path(symphony.collectors.__file__).parents[1]
 EXTRAS = [("collector", name) for name in ("beam_score", "beam_total", "beam_slot", "mask")]
 
 
-def make_env(last: int = 1000, *transforms) -> EnvBase:
-    env = with_rows(Walk(last=last), [ROWS])
-    for transform in transforms:
-        env.append_transform(transform)
-    return env
+def make_env(last=1000):
+    return with_rows(Walk(last=last), [ROWS])
 
 
-def make(env=make_env, policy=None, **kwargs) -> BeamSearchCollector:
-    settings = {
-        "score": distance,
-        "branches": 4,
-        "prune_every": 4,
-        "prepare": give_streams,
-        "slot_keys": [STREAM],
-    }
-    settings |= {"frames_per_batch": FRAMES, "total_frames": 3 * kwargs.get("frames_per_batch", FRAMES)}
-    return BeamSearchCollector(env, policy or Policy(), **settings | kwargs)
-
-
-def plain_collector(**kwargs) -> Collector:
-    settings = {"frames_per_batch": FRAMES, "total_frames": 3 * FRAMES, **kwargs}
-    return Collector(make_env, Policy(), auto_register_policy_transforms=False, **settings)
+def make(env=make_env, policy=None, **kwargs):
+    how = {"score": distance, "frames_per_batch": FRAMES, **SEARCH, **kwargs}
+    return BeamSearchCollector(
+        env, policy or Policy(), **{"total_frames": 3 * how["frames_per_batch"], **how}
+    )
 
 
 def test_best_leaf_and_its_search():
@@ -59,7 +50,6 @@ def test_best_leaf_and_its_search():
         expected = score[:, :, first : first + 4].amax(2).sum(-1, keepdim=True).expand(ROWS, 2, 4)
         assert_close(total[:, :, first : first + 4], expected)
     assert (total[:, 0, -1] <= total[:, 1, -1]).all()
-    # the stream tells the branch that drew the numbers
     assert_close(batch.get(STREAM).squeeze(-1) % 100, slot)
     assert (batch.get(("collector", "traj_ids")).flatten(0, 1) == torch.arange(3, 9)[:, None]).all()
     assert batch.get(("collector", "mask")).all()
@@ -82,7 +72,6 @@ def test_same_seed_same_data():
 
 
 def test_reloading():
-    """A reloaded collector has nothing left to do where the other had not, and counts on."""
     first = make(policy=Policy())
     next(iter(first))
     state = pickle.loads(pickle.dumps(first.state_dict()))  # noqa: S301
@@ -96,7 +85,8 @@ def test_reloading():
     assert len(ids) == 2
     assert min(int(i.min()) for i in ids) >= 2 * ROWS
     assert second.stats()["frames"] == second.total_frames
-    make().load_state_dict(plain_collector().state_dict())
+    plain = Collector(make_env, Policy(), frames_per_batch=FRAMES, total_frames=FRAMES, **PLAIN)
+    make().load_state_dict(plain.state_dict())
 
 
 @pytest.mark.parametrize("leaves", [None, 2])
@@ -128,7 +118,6 @@ def test_trajectories_are_complete_and_stop_at_their_end():
     assert [batch for batch in make(env, replay_buffer=buffer, trajs_per_batch=1) if batch is not None] == []
     assert len(buffer) == 3 * ROWS * 6
     assert (buffer.sample().get("step").reshape(2, 6) == torch.arange(6)).all()
-    # unfinished episodes are not trajectories, unless they are declared truncated
     one = {"trajs_per_batch": 1, "traj_format": "cat"}
     assert not list(make(**one))
     assert len(list(make(set_truncated=True, **one))) == 3 * ROWS
@@ -178,7 +167,6 @@ def test_what_can_not_be_right_is_an_error():
 
 
 def test_a_policy_on_a_device_of_its_own_gets_its_inputs_there():
-    """What it is given is moved, and only what it writes comes back."""
     seen, batches = [], []
 
     class Elsewhere(Policy):
@@ -193,3 +181,159 @@ def test_a_policy_on_a_device_of_its_own_gets_its_inputs_there():
         batches.append(collector.next())
         assert set(seen) == {torch.device("cpu") if options else None}
     assert_same(batches[0].exclude("collector"), batches[1].exclude("collector"))
+
+
+class FreshWalk(Walk):
+    """Seeded by whatever the process would draw next, as unseeded environments are."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.set_seed(int(torch.randint(1 << 31, ())))
+
+
+class Weighted(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(()))
+
+    def forward(self, tensordict):
+        return self.weight * distance(tensordict)
+
+
+def fresh_env():
+    return with_rows(FreshWalk(), [ROWS])
+
+
+def several(env, policy, *, workers=WORKERS, batches=2, score=distance, **kwargs):
+    frames = workers * FRAMES
+    how = {"frames_per_batch": frames, "total_frames": batches * frames} | PLAIN
+    how |= {} if "replay_buffer" in kwargs else {"use_buffers": False, "cat_results": "stack"}
+    bound = BeamSearchCollector.bind(score=score, **SEARCH)
+    return MultiSyncCollector([env] * workers, policy, collector_class=bound, **how, **kwargs)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_started_quickly")
+def test_a_worker_collects_what_the_collector_does_here():
+    collector = several(make_env, Policy(), workers=1)
+    try:
+        collector.set_seed(3)
+        batches = [batch.clone() for batch in collector]
+    finally:
+        collector.shutdown()
+    how = {"score": distance, "frames_per_batch": FRAMES, "total_frames": 2 * FRAMES, **SEARCH}
+    local = BeamSearchCollector(make_env, Policy(), **how)
+    local.set_seed(3)
+    local.reset()  # as the multi-process collector does after seeding
+    for one, other in zip(batches, local, strict=True):
+        assert one.shape == (1, ROWS, STEPS)
+        assert_same(one[0].exclude("collector"), other.exclude("collector"))
+        assert set(one.keys(True, True)) >= set(EXTRAS)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_started_quickly")
+def test_two_workers_fill_a_replay_buffer_with_data_of_their_own():
+    score = Weighted()
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100, shared_init=True), batch_size=5)
+    collector = several(fresh_env, Policy(), score=score, batches=3, replay_buffer=buffer)
+    try:
+        seen = []
+        for batch in collector:
+            assert batch is None
+            seen.append(len(buffer))
+            score.weight.data.fill_(3.0)
+    finally:
+        collector.shutdown()
+    assert len(buffer) == 3 * WORKERS * ROWS
+    assert seen[0] == WORKERS * ROWS
+    assert buffer.sample().shape == (5, STEPS)
+    items = buffer[:]
+    assert len(items.get(X)[:, 0].flatten(1).unique(dim=0)) == len(items)
+    assert len(items.get(("collector", "traj_ids"))[:, 0].unique()) == len(items)
+    factor = items.get(("collector", "beam_score")) / items.get(("next", *X)).squeeze(-1).abs()
+    assert_close(factor.mean((-1, -2))[: seen[0]], torch.ones(seen[0]))
+    assert_close(factor.mean((-1, -2))[-seen[0] :], torch.full((seen[0],), 3.0))
+
+
+def test_workers_that_nobody_seeded_draw_apart():
+    how = {"score": KeyScore("reward", negate=True), "branches": 4, "rule": Systematic(1.0)}
+    collectors, pendulums = [], lambda: with_rows(PendulumEnv(), [ROWS])
+    for worker in range(2):
+        with torch.random.fork_rng([]):
+            torch.manual_seed(0)
+            collectors.append(
+                BeamSearchCollector(pendulums, frames_per_batch=FRAMES, worker_idx=worker, **how)
+            )
+    start = TensorDict(batch_size=[ROWS, 4])
+    assert not torch.equal(*(collector.rule_noise(start) for collector in collectors))
+    firsts = [collector.next() for collector in collectors]
+    for key in ("th", "action"):
+        assert not torch.isclose(firsts[0].get(key), firsts[1].get(key)).any()
+
+
+def read_of_self(name: str) -> set[str]:
+    """Attributes of `self` that a class of the collector's module reads and does not make itself."""
+    tree = ast.parse(Path(inspect.getfile(BeamSearchCollector)).read_text())
+    (found,) = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name == name]
+    own = {node.name for node in found.body if isinstance(node, ast.FunctionDef)}
+    attributes = [node for node in ast.walk(found) if isinstance(node, ast.Attribute)]
+    used = [node for node in attributes if isinstance(node.value, ast.Name) and node.value.id == "self"]
+    own |= {node.attr for node in used if isinstance(node.ctx, ast.Store)}
+    return {node.attr for node in used} - own
+
+
+def test_members_that_the_collector_reads_are_there_and_do_what_is_asked_of_them():
+    how = {"frames_per_batch": 8, "total_frames": 16, "auto_register_policy_transforms": False}
+    plain = Collector(Walk(), Policy(), **how)
+    read = read_of_self("BeamSearchCollector")
+    assert {"env", "policy_device", "postproc", "storing_device", "set_truncated"} <= read
+    assert {name for name in read if name.startswith("_")} == {"_wrapped_policy", "_traj_pool"}
+    missing = sorted(name for name in read if not hasattr(plain, name))
+    assert not missing, f"TorchRL's Collector no longer has {missing}"
+    assert plain._wrapped_policy(plain.env.reset()).get(ACTION).shape == (2, 1)
+    first, second = (plain._traj_pool.get_traj_and_increment(3, device=torch.device("cpu")) for _ in range(2))
+    assert first.dtype == torch.int64
+    assert len(torch.cat([first, second]).unique()) == 6
+
+
+def test_what_the_base_class_calls_is_still_called_so():
+    """Methods that the search replaces: an override that nothing calls any more would be silent."""
+    replaced = {"rollout", "fake_tensordict", "set_seed", "state_dict", "load_state_dict", "stats"}
+    assert replaced <= set(vars(BeamSearchCollector))
+    gone = sorted(name for name in replaced if not callable(getattr(Collector, name, None)))
+    assert not gone, f"TorchRL's Collector no longer has {gone}"
+    calls = ast.walk(ast.parse(inspect.getsource(inspect.getmodule(Collector))))
+    assert "rollout" in {node.attr for node in calls if isinstance(node, ast.Attribute)}
+    # Trajectories of a batch never go on in the next one, by the public option.
+    search = BeamSearchCollector(Walk(), Policy(), score=distance, branches=2, frames_per_batch=8)
+    assert search.reset_at_each_iter
+
+
+def test_bound_classes_are_classes_that_can_be_pickled():
+    bound = BeamSearchCollector.bind(score=distance, branches=4, prune_every=2)
+    again = pickle.loads(pickle.dumps(bound))  # noqa: S301
+    for kind in (bound, again):
+        assert issubclass(kind, BeamSearchCollector)
+        collector = kind(Walk(), Policy(), frames_per_batch=8, total_frames=8)
+        assert (collector.branches, collector.prune_every) == (4, 2)
+        assert next(iter(collector)).shape == (8,)
+    assert bound(Walk(), Policy(), frames_per_batch=8, branches=3).branches == 3
+    more = pickle.loads(pickle.dumps(bound.bind(leaves=2)))  # noqa: S301
+    assert more(Walk(), Policy(), frames_per_batch=8).leaves == 2
+    assert not hasattr(BeamSearchCollector, "settings")
+
+
+def test_collectors_and_objectives_stand_alone():
+    """They import TorchRL, nothing private of it, jaxtyping and each their own, and nothing else of this package."""
+    allowed = {"torch", "tensordict", "torchrl", "jaxtyping", *sys.stdlib_module_names}
+    for package in ("collectors", "objectives"):
+        for source in (ROOM / package).glob("*.py"):
+            nodes = list(ast.walk(ast.parse(source.read_text())))
+            names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+            froms = [node for node in nodes if isinstance(node, ast.ImportFrom)]
+            for name in [*names, *(f"{node.module or ''}.{a.name}" for node in froms for a in node.names)]:
+                first, *rest = name.split(".")
+                assert name.startswith(f"symphony.{package}") or first in allowed, (source.name, name)
+                private = first == "torchrl" and any(part.startswith("_") for part in rest)
+                assert not private, (source.name, name)

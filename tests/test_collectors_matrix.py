@@ -11,29 +11,9 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
+from torchrl import envs, modules
 from torchrl.collectors import Collector
-from torchrl.envs import (
-    CatFrames,
-    Compose,
-    EnvBase,
-    InitTracker,
-    ObservationNorm,
-    RewardSum,
-    StepCounter,
-    Transform,
-    TransformedEnv,
-    VecNormV2,
-)
 from torchrl.envs.utils import check_env_specs
-from torchrl.modules import (
-    AdditiveGaussianModule,
-    EGreedyModule,
-    GRUModule,
-    MPCPlannerBase,
-    ProbabilisticActor,
-    TanhNormal,
-    set_recurrent_mode,
-)
 
 from helpers_collectors import Mass
 from symphony.collectors import BeamSearchCollector, BeamSearchPlanner, KeepAll, KeepBest, KeyScore, with_rows
@@ -41,7 +21,7 @@ from symphony.collectors import BeamSearchCollector, BeamSearchPlanner, KeepAll,
 ROWS, STEPS = 3, 8
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
-ENVIRONMENTS: dict[str, Callable[[], EnvBase]] = {
+ENVIRONMENTS: dict[str, Callable[[], envs.EnvBase]] = {
     "rows": lambda: with_rows(Mass(), [ROWS]),
     "sticky": lambda: with_rows(Mass(sticky=True), [ROWS]),
     "own batch": lambda: Mass((ROWS,)),
@@ -50,13 +30,13 @@ ENVIRONMENTS: dict[str, Callable[[], EnvBase]] = {
     "endless": lambda: with_rows(Mass(limit=99.0), [ROWS]),
 }
 OBSERVED = {"agents": ("agents", "observation")}
-TRANSFORMS: dict[str, Callable[[Any], list[Transform]]] = {
+TRANSFORMS: dict[str, Callable[[Any], list[envs.Transform]]] = {
     "none": lambda key: [],
-    "counters": lambda key: [StepCounter(6), RewardSum()],
-    "init": lambda key: [InitTracker()],
-    "norm": lambda key: [ObservationNorm(0.1, 2.0, in_keys=[key], standard_normal=True)],
-    "frames": lambda key: [CatFrames(3, -1, in_keys=[key], padding="same")],
-    "statistics": lambda key: [VecNormV2(in_keys=[key], reduce_batch_dims=True)],
+    "counters": lambda key: [envs.StepCounter(6), envs.RewardSum()],
+    "init": lambda key: [envs.InitTracker()],
+    "norm": lambda key: [envs.ObservationNorm(0.1, 2.0, in_keys=[key], standard_normal=True)],
+    "frames": lambda key: [envs.CatFrames(3, -1, in_keys=[key], padding="same")],
+    "statistics": lambda key: [envs.VecNormV2(in_keys=[key], reduce_batch_dims=True)],
 }
 
 
@@ -66,21 +46,21 @@ def acting(key: Any, features: int) -> TensorDictModule:
     return TensorDictModule(nn.Sequential(nn.Linear(features, 1), nn.Tanh()), [key], [action])
 
 
-def recurrent() -> tuple[GRUModule, TensorDictSequential]:
+def recurrent() -> tuple[modules.GRUModule, TensorDictSequential]:
     torch.manual_seed(0)
-    memory = GRUModule(input_size=2, hidden_size=4, in_key="observation", out_key="embedding")
+    memory = modules.GRUModule(input_size=2, hidden_size=4, in_key="observation", out_key="embedding")
     head = nn.Sequential(nn.Linear(4, 2), NormalParamExtractor())
     both = TensorDictSequential(memory, TensorDictModule(head, ["embedding"], ["loc", "scale"]))
-    return memory, ProbabilisticActor(both, ["loc", "scale"], distribution_class=TanhNormal)
+    return memory, modules.ProbabilisticActor(both, ["loc", "scale"], distribution_class=modules.TanhNormal)
 
 
-def beams(env: EnvBase, policy: Any, *, key: Any = "reward", **kwargs: Any) -> BeamSearchCollector:
+def beams(env: envs.EnvBase, policy: Any, *, key: Any = "reward", **kwargs: Any) -> BeamSearchCollector:
     frames = env.batch_size.numel() * STEPS
     how = {"branches": 1, "prune_every": 4, "frames_per_batch": frames, "total_frames": frames, **kwargs}
     return BeamSearchCollector(env, policy, score=KeyScore(key, negate=True), **how)
 
 
-def assert_same_until_done(env: Callable[[], EnvBase], policy: Any, **kwargs: Any) -> TensorDictBase:
+def assert_same_until_done(env: Callable[[], envs.EnvBase], policy: Any, **kwargs: Any) -> TensorDictBase:
     """The first batches of both collectors have the same entries, the same up to the first end of an episode."""
     one, ours = env(), beams(env(), policy, **kwargs)
     frames = one.batch_size.numel() * STEPS
@@ -110,17 +90,17 @@ def assert_same_until_done(env: Callable[[], EnvBase], policy: Any, **kwargs: An
         if (t == "statistics") == (e == "endless") and (e, t) != ("agents", "frames")
     ],
 )
-def test_one_branch_is_torchrls_collector(env: str, transforms: str, inside: bool) -> None:
+def test_one_branch_is_torchrls_collector(env, transforms, inside):
     # Statistics are of all rows, also of those that are reset: here no row is.
     key = OBSERVED.get(env, "observation")
 
-    def make() -> EnvBase:
+    def make() -> envs.EnvBase:
         torch.manual_seed(0)
         if inside and env not in ("one", "own batch"):
             limit = 99.0 if env == "endless" else 1.5
             base = Mass(agents=2 if env == "agents" else None, sticky=env == "sticky", limit=limit)
-            return with_rows(TransformedEnv(base, Compose(*TRANSFORMS[transforms](key))), [ROWS])
-        return TransformedEnv(ENVIRONMENTS[env](), Compose(*TRANSFORMS[transforms](key)))
+            return with_rows(envs.TransformedEnv(base, envs.Compose(*TRANSFORMS[transforms](key))), [ROWS])
+        return envs.TransformedEnv(ENVIRONMENTS[env](), envs.Compose(*TRANSFORMS[transforms](key)))
 
     reward = "reward" if isinstance(key, str) else ("agents", "reward")
     found = assert_same_until_done(make, acting(key, 6 if transforms == "frames" else 2), key=reward)
@@ -130,25 +110,25 @@ def test_one_branch_is_torchrls_collector(env: str, transforms: str, inside: boo
 
 @pytest.mark.parametrize("env", ["rows", "own batch", "one"])
 @pytest.mark.parametrize("register", [False, True])
-def test_hidden_states_are_copied_with_a_branch(env: str, register: bool) -> None:
+def test_hidden_states_are_copied_with_a_branch(env, register):
     """Along each leaf they are those that recurrent mode computes from its observations alone."""
     memory, policy = recurrent()
     made = ENVIRONMENTS[env]()
     if not register:
-        made = TransformedEnv(made, Compose(InitTracker(), memory.make_tensordict_primer()))
+        made = envs.TransformedEnv(made, envs.Compose(envs.InitTracker(), memory.make_tensordict_primer()))
     collector = beams(made, policy, branches=4, leaves=4, auto_register_policy_transforms=register)
     collector.frames_per_batch = STEPS
     batch = collector.rollout()
     assert batch.shape == (*made.batch_size, 4, STEPS)
     assert bool((batch["collector", "beam_slot"] != torch.arange(4)[:, None]).any()), "nothing was copied"
     for row in batch.reshape(-1, STEPS):
-        with torch.no_grad(), set_recurrent_mode(True):
+        with torch.no_grad(), modules.set_recurrent_mode(True):
             again = memory(row[None].select(*memory.in_keys).clone())["embedding"]
         torch.testing.assert_close(again[0], row["embedding"])
 
 
-@pytest.mark.parametrize("exploration", [AdditiveGaussianModule, EGreedyModule])
-def test_exploration_takes_the_specs_of_the_environment(exploration: type) -> None:
+@pytest.mark.parametrize("exploration", [modules.AdditiveGaussianModule, modules.EGreedyModule])
+def test_exploration_takes_the_specs_of_the_environment(exploration):
     env = ENVIRONMENTS["rows"]()
     module = exploration(env.action_spec)
     before = module.spec.shape
@@ -159,11 +139,10 @@ def test_exploration_takes_the_specs_of_the_environment(exploration: type) -> No
     assert module.spec.shape == before
 
 
-def test_rows_are_a_batch_of_an_environment() -> None:
-    """In both orders with transforms; several rows are reset apart, and rollouts go on until all have ended."""
+def test_rows_are_a_batch_of_an_environment():
     for env in (
-        with_rows(TransformedEnv(Mass(), StepCounter()), [ROWS]),
-        TransformedEnv(with_rows(Mass(), [ROWS]), StepCounter()),
+        with_rows(envs.TransformedEnv(Mass(), envs.StepCounter()), [ROWS]),
+        envs.TransformedEnv(with_rows(Mass(), [ROWS]), envs.StepCounter()),
     ):
         check_env_specs(env)
         assert len(env.reset()["observation"].unique(dim=0)) == ROWS
@@ -173,11 +152,11 @@ def test_rows_are_a_batch_of_an_environment() -> None:
         with_rows(Mass((ROWS,)), [2])
 
 
-def test_what_can_not_be_right_is_refused() -> None:
+def test_what_can_not_be_right_is_refused():
     seen = {"in_keys": ["observation"]}
-    twice = Compose(CatFrames(2, -1, **seen), ObservationNorm(0.0, 1.0, **seen))
-    for transform, why in ((VecNormV2(**seen), "reduce_batch_dims"), (twice, "must come after")):
-        env = TransformedEnv(with_rows(Mass(), [ROWS]), transform)
+    twice = envs.Compose(envs.CatFrames(2, -1, **seen), envs.ObservationNorm(0.0, 1.0, **seen))
+    for transform, why in ((envs.VecNormV2(**seen), "reduce_batch_dims"), (twice, "must come after")):
+        env = envs.TransformedEnv(with_rows(Mass(), [ROWS]), transform)
         with pytest.raises(ValueError, match=why):
             beams(env, None, branches=2).next()
 
@@ -206,7 +185,7 @@ def returns(env: Mass, start: TensorDictBase, value: Any = None) -> tuple[Tensor
 
 
 @pytest.mark.parametrize("valued", [False, True])
-def test_without_pruning_it_is_the_best_of_all_branches(valued: bool) -> None:
+def test_without_pruning_it_is_the_best_of_all_branches(valued):
     env = Mass()
     start = with_rows(env, [ROWS]).reset()
 
@@ -232,19 +211,18 @@ def test_without_pruning_it_is_the_best_of_all_branches(valued: bool) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:Nested TransformedEnvs:UserWarning")
-@pytest.mark.parametrize("outer", [None, StepCounter, "frames"])
-def test_it_is_a_policy_of_torchrl(outer: Any) -> None:
-    """In rollouts and collectors, through transforms; it keeps a point within its bounds."""
+@pytest.mark.parametrize("outer", [None, envs.StepCounter, "frames"])
+def test_it_is_a_policy_of_torchrl(outer):
 
     def make() -> Any:
         env = with_rows(Mass(limit=1.0), [ROWS])
         if outer is None:
             return env
-        frames = CatFrames(2, -1, in_keys=["observation"])
-        return TransformedEnv(env, frames if outer == "frames" else outer())
+        frames = envs.CatFrames(2, -1, in_keys=["observation"])
+        return envs.TransformedEnv(env, frames if outer == "frames" else outer())
 
     planner = BeamSearchPlanner(make(), HORIZON, 32, rule=KeepBest(0.5), prune_every=3)
-    assert isinstance(planner, MPCPlannerBase)
+    assert isinstance(planner, modules.MPCPlannerBase)
     torch.manual_seed(0)
     planned, drawn = (make().rollout(20, policy, break_when_any_done=False) for policy in (planner, None))
     assert planned["next", "reward"].mean() > drawn["next", "reward"].mean() + 0.2

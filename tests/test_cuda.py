@@ -22,7 +22,7 @@ from helpers_segments import crossing, straight_road
 from helpers_store import fill
 from symphony import keys
 from symphony.agents import build_agent
-from symphony.collectors import KeepBest, PruningRule, Systematic
+from symphony.collectors import KeepBest, Systematic
 from symphony.config import EvaluateConfig, MGAILConfig
 from symphony.data.store import SegmentStore
 from symphony.envs import DrivingEnv
@@ -55,7 +55,7 @@ def never_waiting() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("space", ["bicycle", "displacement", "histogram"])
-def test_simulations(space: Any) -> None:
+def test_simulations(space):
     found = []
     for device in ("cpu", CUDA, CUDA):
         agent, env = world(space, device)
@@ -73,7 +73,7 @@ def test_simulations(space: Any) -> None:
 
 
 @pytest.mark.parametrize("rule", [KeepBest(0.5), Systematic(0.6)], ids=repr)
-def test_searches(rule: PruningRule) -> None:
+def test_searches(rule):
     here = searched(*world("bicycle", "cpu"), rule)
     agent, env = world("bicycle", CUDA)
     there = searched(agent, env, rule)
@@ -112,7 +112,7 @@ def loss_and_gradients(name: str, space: str, device: str) -> tuple[TensorDict, 
 
 
 @pytest.mark.parametrize(("name", "space"), CASES)
-def test_losses_and_their_gradients(name: str, space: str) -> None:
+def test_losses_and_their_gradients(name, space):
     there, gradients = loss_and_gradients(name, space, CUDA)
     assert all(value.isfinite().all() for value in gradients.values())
     assert gradients
@@ -132,9 +132,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("method", ["bc_ts_h", "mgail_ts_h"])
-def test_training_and_evaluation_are_repeated_and_resumed_to_the_bit(
-    method: Any, store: Path, tmp_path: Path
-) -> None:
+def test_training_and_evaluation_are_repeated_and_resumed_to_the_bit(method, store, tmp_path):
     def trained(name: str, resume: bool = False) -> Path:
         mgail = MGAILConfig(regression=0, head_start=0, rollouts=4)
         return train(tiny(method, store, tmp_path / name, mgail=mgail, device=CUDA, resume=resume))

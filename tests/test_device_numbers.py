@@ -17,7 +17,7 @@ from helpers_losses import CASES, ROWS, SCENES, batch_of, losses, searched, spec
 from helpers_segments import crossing, ring, straight_road
 from symphony import keys
 from symphony.agents import build_agent
-from symphony.collectors import KeepBest, PruningRule, Systematic
+from symphony.collectors import KeepBest, Systematic
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.edge import map_edge
 from symphony.roadgraph import LaneGraph
@@ -36,13 +36,7 @@ def assert_same_step(found: TensorDictBase, expected: TensorDictBase, *, atol: f
         torch.testing.assert_close(one, other, atol=atol, rtol=0)
 
 
-EVERYTHING: dict[str, Any] = {
-    "route": True,
-    "along": True,
-    "gaps": True,
-    "clearance": True,
-    "foresight": (0.5, 1.0),
-}
+EVERYTHING = {"route": True, "along": True, "gaps": True, "clearance": True, "foresight": (0.5, 1.0)}
 GROUPS = {"points": (), "lights": (), "objects": ("gap", "gap_ahead", "along")}
 
 
@@ -82,9 +76,7 @@ def elements(seen: Any, group: str) -> Tensor:
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("counts", [(3, 60, 2), (16, 4000, 30)])
 @torch.no_grad()
-def test_a_device_sees_and_flags_the_same(
-    counts: tuple[int, int, int], seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_device_sees_and_flags_the_same(counts, seed, monkeypatch):
     segments = [crossing(6, seed=seed), straight_road(5, seed=seed), ring()]
     scenes = collate([scene(s, [0, 1], LaneGraph(s.road)) for s in segments])
     env = DrivingEnv(scenes, observation=ObservationConfig(*counts, **EVERYTHING))
@@ -105,7 +97,7 @@ def test_a_device_sees_and_flags_the_same(
 
 
 @pytest.mark.parametrize(("name", "space"), CASES)
-def test_a_device_learns_the_same(name: str, space: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_learns_the_same(name, space, monkeypatch):
     torch.manual_seed(0)
     every = spec(space)
     # All points, as of several at one distance a device may see others.
@@ -124,7 +116,6 @@ def test_a_device_learns_the_same(name: str, space: str, monkeypatch: pytest.Mon
 
 
 def differentiated(loss: Any, given: Any) -> list[Tensor]:
-    """A loss, and its gradients."""
     loss.zero_grad()
     torch.manual_seed(0)
     out = loss(given.copy())
@@ -137,7 +128,7 @@ def differentiated(loss: Any, given: Any) -> list[Tensor]:
 
 @pytest.mark.parametrize("rule", [KeepBest(0.5), Systematic(0.6)], ids=repr)
 @torch.no_grad()
-def test_a_device_finds_the_same(rule: PruningRule, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_finds_the_same(rule, monkeypatch):
     torch.manual_seed(0)
     agent = build_agent("agent", spec("bicycle"))
     env = DrivingEnv(SCENES, agent.dynamics, agent.observation)
@@ -154,7 +145,7 @@ SEES = ObservationConfig(num_objects=3, num_points=60, clearance=True, foresight
 
 @pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
 @torch.no_grad()
-def test_a_compiled_step_is_the_step() -> None:
+def test_a_compiled_step_is_the_step():
     torch.compiler.reset()
     segments = [straight_road(), crossing(6)]
     scenes = [scene(s, [0, 1], edge=map_edge(LaneGraph(s.road))) for s in segments]
@@ -169,7 +160,7 @@ def test_a_compiled_step_is_the_step() -> None:
 
 @pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
 @torch.no_grad()
-def test_an_environment_is_compiled_where_it_is_and_its_copies_are_not() -> None:
+def test_an_environment_is_compiled_where_it_is_and_its_copies_are_not():
     torch.compiler.reset()
     env = DrivingEnv(
         collate([scene(straight_road(), [0, 1])]), Displacement(), ObservationConfig.nothing(), seed=0

@@ -33,7 +33,7 @@ def controls(count: int = 64, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor
     return 8 * unit[0] - 4, unit[1] - 0.5, 3 + 9 * unit[2]
 
 
-def test_bicycle_inverse_recovers_the_controls() -> None:
+def test_bicycle_inverse_recovers_the_controls():
     state, (acceleration, steering, length) = states(), controls()
     after = bicycle_step(state, acceleration, steering, length, DT)
     moved = after[:, 3] > 0  # a vehicle that stops within the step loses part of its braking
@@ -42,7 +42,7 @@ def test_bicycle_inverse_recovers_the_controls() -> None:
     torch.testing.assert_close(got[1][moved], steering[moved])
 
 
-def test_displacement_inverse_and_forward_are_exact() -> None:
+def test_displacement_inverse_and_forward_are_exact():
     state, other = states(seed=2), states(seed=3)
     action = displacement_inverse(state, other)
     torch.testing.assert_close(displacement_step(state, action, LENGTH, DT)[:, :2], other[:, :2])
@@ -51,7 +51,7 @@ def test_displacement_inverse_and_forward_are_exact() -> None:
 
 
 @given(angle=st.floats(-3, 3), x=st.floats(-50, 50), y=st.floats(-50, 50))
-def test_moving_the_world_moves_the_result(angle: float, x: float, y: float) -> None:
+def test_moving_the_world_moves_the_result(angle, x, y):
     state, (acceleration, steering, length) = states(), controls()
     turn, shift = torch.tensor(angle, dtype=torch.float64), torch.tensor([x, y], dtype=torch.float64)
 
@@ -68,7 +68,7 @@ def test_moving_the_world_moves_the_result(angle: float, x: float, y: float) -> 
     )
 
 
-def test_gradients() -> None:
+def test_gradients():
     state, (acceleration, steering, length) = states(4), controls(4)
     inputs = [t.clone().requires_grad_() for t in (state, acceleration, steering)]
     assert torch.autograd.gradcheck(lambda s, a, d: bicycle_step(s, a, d, length, DT), inputs)
@@ -79,8 +79,8 @@ def test_gradients() -> None:
     assert torch.autograd.gradcheck(lambda s, d: displacement_step(s, d, LENGTH, DT), inputs)
 
 
-def drive(seed: int, steps: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
-    """States [8, T, 4] of smoothly driven vehicles and their lengths."""
+def drive(seed, steps=50):
+    """States [8, T, 4] of smoothly driven vehicles, their sizes, and that all of them are valid."""
     rng = torch.Generator().manual_seed(seed)
     state = torch.cat([torch.zeros(8, 3), 4 + 8 * torch.rand(8, 1, generator=rng)], -1)
     length, phase = torch.full((8,), 4.6), 6 * torch.rand(8, generator=rng)
@@ -88,12 +88,12 @@ def drive(seed: int, steps: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
     for t in range(steps):
         swing = torch.sin(phase + 0.1 * t)
         path.append(bicycle_step(path[-1], 1.7 * swing.cos(), 0.12 * swing, length, DT))
-    return torch.stack(path, 1), length
+    path = torch.stack(path, 1)
+    return path, torch.stack([length, 0.4 * length], -1), torch.ones(path.shape[:2], dtype=torch.bool)
 
 
-def test_greedy_fit_follows_smooth_driving() -> None:
-    path, length = drive(0)
-    size, valid = torch.stack([length, 0.4 * length], -1), torch.ones(path.shape[:2], dtype=torch.bool)
+def test_greedy_fit_follows_smooth_driving():
+    path, size, valid = drive(0)
     actions, fitted = Bicycle().fit(path, valid, size, DT)
     assert actions.shape == (8, 50)
     error = (fitted - path)[..., :2].norm(dim=-1)
@@ -105,18 +105,16 @@ def test_greedy_fit_follows_smooth_driving() -> None:
         torch.testing.assert_close(replay, fitted[:, t + 1])
 
 
-def test_displacement_fit_is_exact_in_position() -> None:
-    path, length = drive(1)
-    size, valid = torch.stack([length, 0.4 * length], -1), torch.ones(path.shape[:2], dtype=torch.bool)
+def test_displacement_fit_is_exact_in_position():
+    path, size, valid = drive(1)
     _, fitted = Displacement().fit(path, valid, size, DT)
     torch.testing.assert_close(fitted[..., :2], path[..., :2], atol=1e-4, rtol=0)
     assert wrap(fitted[..., 2] - path[..., 2]).abs().max() < 0.05
 
 
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
-def test_fit_starts_anew_where_an_agent_reappears(dynamics: Bicycle | Displacement) -> None:
-    path, length = drive(2)
-    size, valid = torch.stack([length, 0.4 * length], -1), torch.ones(path.shape[:2], dtype=torch.bool)
+def test_fit_starts_anew_where_an_agent_reappears(dynamics):
+    path, size, valid = drive(2)
     valid[:, :5] = valid[:, 20:30] = False
     hidden = torch.where(valid[..., None], path, torch.zeros(()))
     _, fitted = dynamics.fit(hidden, valid, size, DT)
@@ -125,8 +123,7 @@ def test_fit_starts_anew_where_an_agent_reappears(dynamics: Bicycle | Displaceme
 
 
 @given(st.floats(3, 25), st.floats(-3, 3), st.integers(0, 146))
-def test_the_fit_finds_the_action_that_was_taken(speed: float, heading: float, action: int) -> None:
-    """Wherever that shows: no other action leads to the same position, heading and speed."""
+def test_the_fit_finds_the_action_that_was_taken(speed, heading, action):
     dynamics = Bicycle()
     state = torch.tensor([[5.0, -2.0, heading, speed]], dtype=torch.float64)
     size = torch.tensor([[4.5, 2.0]], dtype=torch.float64)
@@ -139,7 +136,7 @@ def test_the_fit_finds_the_action_that_was_taken(speed: float, heading: float, a
 
 
 @pytest.mark.parametrize("action", [-1, 147, 999])
-def test_an_action_that_is_none_is_refused(action: int) -> None:
+def test_an_action_that_is_none_is_refused(action):
     state, size = torch.zeros(2, 3, 4), torch.full((2, 3, 2), 4.0)
     with pytest.raises(IndexError):
         Bicycle().step(state, torch.full((2, 3), action), size, 0.2)

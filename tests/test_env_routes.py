@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from helpers_segments import CAR, crossing, straight_road
+from helpers_segments import CAR, crossing, make_road, straight_road
 from symphony import keys
-from symphony.data.segment import Polylines, RunSegment
+from symphony.data.segment import RunSegment
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.edge import leaving
 from symphony.envs.objects import Objects, entering
@@ -47,17 +46,14 @@ def scenes_of(*segments: RunSegment, n: int = 2) -> Any:
     return collate([scene(s, list(range(n)), LaneGraph(s.road)) for s in segments])
 
 
-def make_env(
-    *segments: RunSegment, dynamics: Any = None, config: ObservationConfig = EVERYTHING
-) -> DrivingEnv:
+def make_env(*segments, dynamics=None, config=EVERYTHING):
     return DrivingEnv(scenes_of(*segments), dynamics, config)
 
 
-def bend(straight: int = 10, turn: float = 1.6, radius: float = 15.0) -> NDArray[np.float64]:
+def bend(straight=10, turn=1.6, radius=15.0):
     """A line of points 3 m apart: straight along +x, then a turn, then straight again."""
-    angle = np.concatenate(
-        [np.zeros(straight), np.linspace(0, turn, max(2, round(abs(turn) * radius / SPACING))), [turn] * 12]
-    )
+    count = max(2, round(abs(turn) * radius / SPACING))
+    angle = np.concatenate([np.zeros(straight), np.linspace(0, turn, count), [turn] * 12])
     steps = SPACING * np.stack([np.cos(angle), np.sin(angle)], -1)
     return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, 0)])[:POINTS]
 
@@ -89,9 +85,7 @@ headings = st.floats(-6, 6)
 
 
 @given(lines, st.floats(0, 0.999), st.floats(-3, 3), headings)
-def test_seen_points_are_the_routes_points_ahead(
-    line: NDArray[np.float64], where: float, offset: float, heading: float
-) -> None:
+def test_seen_points_are_the_routes_points_ahead(line, where, offset, heading):
     k = int(where * len(line))
     place = line[k] + [0.0, offset]
     seen = see(*place, heading, line)
@@ -112,9 +106,7 @@ def test_seen_points_are_the_routes_points_ahead(
 
 
 @given(lines, st.floats(0, 6), st.floats(-500, 500), st.floats(-500, 500))
-def test_moving_the_world_changes_no_feature(
-    line: NDArray[np.float64], angle: float, x: float, y: float
-) -> None:
+def test_moving_the_world_changes_no_feature(line, angle, x, y):
     def there(points: NDArray[np.float64]) -> NDArray[np.float64]:
         turned = (points[..., 0] + 1j * points[..., 1]) * np.exp(1j * angle) + complex(x, y)
         return np.stack([turned.real, turned.imag], -1)
@@ -131,7 +123,7 @@ def test_moving_the_world_changes_no_feature(
         torch.testing.assert_close(one, two, atol=1e-6, rtol=0)
 
 
-def test_without_a_route_all_features_are_zero() -> None:
+def test_without_a_route_all_features_are_zero():
     state, none = torch.randn(2, 3, 4), torch.zeros(2, 3, dtype=torch.int64)
     for point in (torch.zeros(0, 2), 1e6 * torch.randn(50, 2)):
         seen = route_ahead(state, FollowedRoutes(point, none, none).window(torch.zeros(2, 3)), SCALE)
@@ -149,7 +141,7 @@ def test_without_a_route_all_features_are_zero() -> None:
 
 
 @given(st.integers(2, 40), st.integers(0, 2**31 - 1))
-def test_what_else_is_in_the_table_changes_nothing(count: int, seed: int) -> None:
+def test_what_else_is_in_the_table_changes_nothing(count, seed):
     rng = np.random.default_rng(seed)
     line = np.cumsum(SPACING * np.array([1.0, 0.0]) + rng.normal(0, 0.4, (count, 2)), 0)
     state = torch.from_numpy(np.concatenate([rng.normal(0, 20, 2), rng.normal(0, 2, 2)]))[None, None]
@@ -182,10 +174,7 @@ def test_what_else_is_in_the_table_changes_nothing(count: int, seed: int) -> Non
 
 
 @given(lines, st.integers(2, POINTS - 2), st.floats(-3.5, 3.5), headings)
-def test_turns_say_where_a_route_bends(
-    line: NDArray[np.float64], where: int, aside: float, heading: float
-) -> None:
-    """They are the sines of the angles between its steps."""
+def test_turns_say_where_a_route_bends(line, where, aside, heading):
     where = min(where, len(line) - 1)
     jumped = line + np.where(np.arange(len(line)) >= where, aside, 0.0)[:, None] * [0.0, 1.0]
     state = torch.tensor([[[*line[0], heading, 5.0]]], dtype=torch.float64)
@@ -203,7 +192,7 @@ def test_turns_say_where_a_route_bends(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_logged_route_is_where_the_vehicle_drove(seed: int) -> None:
+def test_the_logged_route_is_where_the_vehicle_drove(seed):
     segment = crossing(4, seed=seed, steps=61)
     graph, turns = LaneGraph(segment.road), []
     for agent in range(4):
@@ -218,12 +207,11 @@ def test_the_logged_route_is_where_the_vehicle_drove(seed: int) -> None:
         assert away[table.logged] <= min(away) + 0.12
         if abs(segment.heading[agent, -1] - segment.heading[agent, 0]) > 1:
             turns.append(sorted(away)[1])
-    # A route that does not turn leads away from who does.
     assert turns
     assert min(turns) > 0.5
 
 
-def test_a_vehicle_on_no_lane_has_no_route() -> None:
+def test_a_vehicle_on_no_lane_has_no_route():
     segment = straight_road(2)
     position = segment.position.copy()
     position[1, :, 1] += 60
@@ -240,7 +228,7 @@ def test_a_vehicle_on_no_lane_has_no_route() -> None:
 
 
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
-def test_a_goal_stays_and_can_be_started_from(dynamics: Any) -> None:
+def test_a_goal_stays_and_can_be_started_from(dynamics):
     env = make_env(straight_road(), crossing(), dynamics=dynamics)
     plan = actions(env, (2, 12))
     start = env.with_goals(env.start(torch.tensor([0, 1])), torch.tensor([[1, 0], [2, -1]]))
@@ -255,26 +243,7 @@ def test_a_goal_stays_and_can_be_started_from(dynamics: Any) -> None:
     assert fresh[keys.GOAL].tolist() == [[-1, -1], [2, -1]]
 
 
-@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
-def test_a_rollout_with_goals_is_the_same_in_any_batch(dynamics: Any) -> None:
-    segment = straight_road(5, num_lanes=2)
-    alone = make_env(segment, dynamics=dynamics)
-    among = make_env(crossing(7, seed=2), segment, straight_road(8, steps=61, seed=5), dynamics=dynamics)
-    assert among.scenes.route_count.shape[2] > alone.scenes.route_count.shape[2]
-    plan, goal = actions(alone, (1, 20)), torch.tensor([[1, 0]])
-    one = run(alone, alone.with_goals(alone.start(torch.tensor([0]), 6), goal), plan)
-    start = among.start(torch.tensor([[2, 1], [0, 0]]), torch.tensor([[1, 6], [7, 8]]))
-    start = among.with_goals(start, goal.expand(2, 2, 2))
-    wide = run(among, start, plan.expand(2, 2, 20, *plan.shape[2:]))[0, 1]
-    for key in (
-        *(keys.STATE, keys.OWN, keys.ROUTE, keys.ROAD, keys.GOAL, keys.PROGRESS),
-        *(keys.COLLISION, keys.OFFROAD),
-    ):
-        assert torch.equal(one[key][0], wide[key]), key
-    assert torch.equal(one[keys.GAP][0].sort(-1).values, wide[keys.GAP].sort(-1).values)
-
-
-def test_the_gradient_of_what_is_seen_matches_finite_differences() -> None:
+def test_the_gradient_of_what_is_seen_matches_finite_differences():
     line = bend(straight=4, turn=1.0, radius=20)
     point = torch.from_numpy(line)
     routes = FollowedRoutes(point, torch.zeros(1, 3, dtype=torch.int64), torch.tensor([[len(line)] * 3]))
@@ -284,7 +253,7 @@ def test_the_gradient_of_what_is_seen_matches_finite_differences() -> None:
     assert torch.autograd.gradcheck(lambda s: route_ahead(s, seen, SCALE), (start,))
 
 
-def test_gaps_ahead_are_those_after_everyone_kept_speed_and_course() -> None:
+def test_gaps_ahead_are_those_after_everyone_kept_speed_and_course():
     times = (0.5, 1.0, 2.0)
     config = ObservationConfig(num_objects=16, num_points=1, clearance=True, foresight=times)
     env = make_env(crossing(7), straight_road(5), config=config)
@@ -299,11 +268,6 @@ def test_gaps_ahead_are_those_after_everyone_kept_speed_and_course() -> None:
         there = objects[..., :2] * SCALE + objects[..., 4:6] * 10 * time
         expected = box_gap(own, zero, size, there, heading, objects[..., 8:10] * 5)
         torch.testing.assert_close(ahead[..., k][mask], expected[mask], atol=2e-3, rtol=0)
-    # Seeing ahead changes nothing else.
-    plain = make_env(crossing(7), straight_road(5), config=ObservationConfig(16, 1, clearance=True))
-    other = run(plain, plain.start(torch.arange(2)[:, None].expand(2, 3)), actions(env, (2, 3, 8)))
-    assert torch.equal(other[keys.GAP], out[keys.GAP])
-    assert other.get(keys.GAP_AHEAD, None) is None
 
 
 CROSSING = crossing(4)
@@ -314,7 +278,7 @@ _AREA = shapely.Polygon(np.concatenate(_EDGES))
 
 @settings(max_examples=25)
 @given(st.floats(-40, 40), st.floats(-40, 40), st.floats(-4, 4))
-def test_road_distances_are_those_of_centre_and_corners(x: float, y: float, heading: float) -> None:
+def test_road_distances_are_those_of_centre_and_corners(x, y, heading):
     start = CROSSING_ENV.start(torch.tensor([0]))
     state = start[keys.STATE].clone()
     state[0, 0, :3] = torch.tensor([x, y, heading])
@@ -357,7 +321,7 @@ def loop(turns: float = 2.2, radius: float = 12.0) -> NDArray[np.float64]:
 
 @given(st.floats(1.0, 8.0), st.floats(-2.5, 2.5), st.floats(0.5, 3.0))
 @settings(max_examples=25)
-def test_a_route_that_passes_itself_is_followed_in_order(speed: float, aside: float, dt: float) -> None:
+def test_a_route_that_passes_itself_is_followed_in_order(speed, aside, dt):
     line = loop()
     stations = np.arange(0.0, SPACING * (len(line) - 2), min(speed * dt, 9.0))
     place = np.stack([np.interp(stations, SPACING * np.arange(len(line)), line[:, k]) for k in (0, 1)], -1)
@@ -374,14 +338,13 @@ def test_a_route_that_passes_itself_is_followed_in_order(speed: float, aside: fl
     reference = stations_along(line[None], path.numpy()[None], np.ones((1, len(path)), bool))[0]
     # Where two chords meet, both are as near to what is outside of the bend.
     np.testing.assert_allclose(found, reference[: len(found)], atol=1.0)
-    # What is seen ahead belongs to the pass that the agent is on.
     middle = len(found) // 2
     seen = routes.window(torch.tensor([[found[middle]]], dtype=torch.float64))
     first = round(found[middle] / SPACING) - int(seen.own)
     assert torch.equal(seen.points[0, 0, 0], torch.from_numpy(line[first]))
 
 
-def test_an_agent_whose_routes_cannot_be_built_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_agent_whose_routes_cannot_be_built_has_none(monkeypatch):
     segment = crossing(4)
 
     def broken(*_: Any, **__: Any) -> Any:
@@ -395,22 +358,10 @@ def test_an_agent_whose_routes_cannot_be_built_has_none(monkeypatch: pytest.Monk
     assert scene(segment, [0], LaneGraph(segment.road)).route_logged[0, 0] >= 0
 
 
-def test_who_drives_under_a_bridge_has_no_route_over_it() -> None:
+def test_who_drives_under_a_bridge_has_no_route_over_it():
     segment = straight_road(2, num_lanes=1, steps=21)
     lane = segment.road.lanes[0]
-    above = lane + np.array([0.0, 0.5, 6.0], np.float32)
-    road = replace(
-        segment.road,
-        **{
-            name: np.repeat(getattr(segment.road, name)[:1], 2, 0)
-            for name in ("lane_type", "speed_limit", "lane_width")
-        },
-        lanes=Polylines.of([lane, above]),
-        lane_id=np.arange(2),
-        successors=np.zeros((0, 2), np.int32),
-        left_neighbors=np.zeros((0, 2), np.int32),
-        right_neighbors=np.zeros((0, 2), np.int32),
-    )
+    road = make_road([lane, lane + np.array([0.0, 0.5, 6.0], np.float32)])
     for height, aside in ((0.0, 0.0), (6.0, 0.5)):
         position = segment.position.copy()
         position[..., 1] += lane[0, 1] - position[0, 0, 1]
@@ -434,9 +385,7 @@ def test_who_drives_under_a_bridge_has_no_route_over_it() -> None:
     ],
 )
 @pytest.mark.parametrize("angle", [0.0, 2.0])
-def test_who_enters_would_meet_nobody_within_a_second(
-    ahead: float, aside: float, speed: float, its_speed: float, enters: bool, angle: float
-) -> None:
+def test_who_enters_would_meet_nobody_within_a_second(ahead, aside, speed, its_speed, enters, angle):
     forward, left = (
         torch.tensor([np.cos(angle), np.sin(angle)]),
         torch.tensor([-np.sin(angle), np.cos(angle)]),
@@ -456,8 +405,8 @@ def test_who_enters_would_meet_nobody_within_a_second(
         assert entering(objects, torch.tensor(index), ready)[0, slot].item() == enters
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_on_a_device_the_same_enter(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("seed", range(3))
+def test_on_a_device_the_same_enter(seed, monkeypatch):
     """There all are compared with all, as to look for those that are ready would wait for it."""
     rng = torch.Generator().manual_seed(seed)
     rows, agents, driven = 6, 9, 5
@@ -474,7 +423,7 @@ def test_on_a_device_the_same_enter(seed: int, monkeypatch: pytest.MonkeyPatch) 
     assert not entering(objects, index, torch.zeros_like(ready)).any()
 
 
-def test_who_is_beyond_any_side_of_the_map_has_left() -> None:
+def test_who_is_beyond_any_side_of_the_map_has_left():
     hull = torch.tensor([[[1.0, 0, 10], [-1, 0, 10], [0, 1, 10], [0, -1, 10], [0, 0, 0]]])
     after = torch.tensor([[[9.0, -9], [11, 0], [-11, 9], [0, 10.5], [3, -12]]])
     none = torch.zeros(1, 2, 4)

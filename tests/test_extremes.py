@@ -17,28 +17,14 @@ from helpers_segments import crossing, make_road, make_segment, straight_road
 from helpers_store import fill
 from symphony.agents import Agent
 from symphony.config import AgentConfig, EvaluateConfig, MGAILConfig
-from symphony.data.segment import (
-    MAX_COORDINATE,
-    MAX_DT,
-    MAX_HEADING,
-    MAX_HEIGHT,
-    MAX_JUMP,
-    MAX_SIZE,
-    MAX_SPEED,
-    MIN_DT,
-    MIN_SIZE,
-    AgentType,
-    RunSegment,
-    SignalState,
-    validate,
-)
+from symphony.data import segment as schema
 from symphony.data.store import SegmentStore
 from symphony.evaluation import evaluate
 
 STEPS = 5
 
 
-def road(**changes: Any) -> RunSegment:
+def road(**changes: Any) -> schema.RunSegment:
     """Three cars on three lanes."""
     return straight_road(**{"num_agents": 3, "steps": STEPS, **changes})
 
@@ -47,11 +33,11 @@ def line(*points: Any) -> Any:
     return np.asarray(points, float)
 
 
-def with_road(segment: RunSegment, **changes: Any) -> RunSegment:
+def with_road(segment: schema.RunSegment, **changes: Any) -> schema.RunSegment:
     return segment.replace(road=dataclasses.replace(segment.road, **changes))
 
 
-def only(segment: RunSegment, seen: Any) -> RunSegment:
+def only(segment: schema.RunSegment, seen: Any) -> schema.RunSegment:
     """With agents seen at some steps [A, T] only."""
     valid = np.broadcast_to(np.asarray(seen, bool), segment.valid.shape).copy()
     zero = {name: getattr(segment, name).copy() for name in ("position", "heading", "velocity")}
@@ -60,9 +46,7 @@ def only(segment: RunSegment, seen: Any) -> RunSegment:
     return segment.replace(valid=valid, **zero)
 
 
-def moving(
-    speed: float, *, dt: float = 0.2, agents: int = 2, steps: int = STEPS, heading: float = 0.0
-) -> RunSegment:
+def moving(speed, *, dt=0.2, agents=2, steps=STEPS, heading=0.0):
     """Agents that keep a speed, 30 m beside each other, from behind the origin on."""
     reach = speed * dt * (steps - 1)
     x = np.linspace(-reach / 2, reach / 2, steps) + np.zeros((agents, 1))
@@ -72,16 +56,18 @@ def moving(
     return make_segment(make_road(lanes), np.stack([x, y], -1), np.full_like(x, heading), velocity, dt)
 
 
-def placed(position: Any, segment: RunSegment) -> RunSegment:
+def placed(position: Any, segment: schema.RunSegment) -> schema.RunSegment:
     """Agents of a segment at [A, 2] throughout, at rest."""
     where = segment.position.copy()
     where[..., :2] = np.asarray(position, np.float32)[:, None]
     return segment.replace(position=where, velocity=np.zeros_like(segment.velocity))
 
 
-def far_away() -> RunSegment:
+def far_away() -> schema.RunSegment:
     base = road()
-    shift = np.array([MAX_COORDINATE - 400, -MAX_COORDINATE + 400, MAX_HEIGHT - 1], np.float32)
+    shift = np.array(
+        [schema.MAX_COORDINATE - 400, -schema.MAX_COORDINATE + 400, schema.MAX_HEIGHT - 1], np.float32
+    )
     moved = {
         name: dataclasses.replace(getattr(base.road, name), points=getattr(base.road, name).points + shift)
         for name in ("lanes", "boundary", "marks")
@@ -89,14 +75,14 @@ def far_away() -> RunSegment:
     return with_road(base.replace(position=base.position + shift), **moved)
 
 
-def jumping() -> RunSegment:
+def jumping() -> schema.RunSegment:
     base = moving(10.0)
     places = base.position.copy()
-    places[:, 1::2, 0] += MAX_JUMP - 50
+    places[:, 1::2, 0] += schema.MAX_JUMP - 50
     return base.replace(position=places)
 
 
-def zigzag() -> RunSegment:
+def zigzag() -> schema.RunSegment:
     """A lane that turns back at every point, and follows itself."""
     xs = np.arange(60) % 2 * 3.0
     lanes = [np.stack([xs, np.zeros(60)], -1), line((5, 5), (5, 5), (5, 5))]
@@ -105,30 +91,26 @@ def zigzag() -> RunSegment:
     )
 
 
-def logged_twice() -> RunSegment:
+def logged_twice() -> schema.RunSegment:
     """Two agents that are one and the same in all but their id."""
     base = road(num_agents=2)
     same = {name: getattr(base, name)[[0, 0]] for name in ("position", "heading", "velocity", "size")}
     return base.replace(**same)
 
 
-def tangle() -> RunSegment:
+def tangle() -> schema.RunSegment:
     """Every lane leads to every other one."""
     pairs = [(a, b) for a in range(6) for b in range(6)]
     lanes = [line((0, k), (30, k), (60, k)) for k in range(6)]
     return road().replace(road=make_road(lanes, successors=pairs, left=pairs, right=pairs))
 
 
-def with_agents(**changes: Any) -> RunSegment:
-    return road().replace(**changes)
-
-
-def with_lights(count: int, state: SignalState) -> RunSegment:
+def with_lights(count: int, state: schema.SignalState) -> schema.RunSegment:
     shown, place = np.full((count, STEPS), state, np.uint8), np.zeros((count, 3), np.float32)
     return road().replace(signal_lane=np.zeros(count, np.int32), signal_point=place, signal_state=shown)
 
 
-SCENES: dict[str, Callable[[], RunSegment]] = {
+SCENES: dict[str, Callable[[], schema.RunSegment]] = {
     "one agent": lambda: road(num_agents=1),
     "256 in one spot": lambda: placed(np.tile([[40.0, 0.0]], (256, 1)), road(num_agents=256, num_lanes=2)),
     "10 km apart": lambda: placed([(0, 0), (7000, 7000), (-7000, -7000)], road()),
@@ -149,21 +131,25 @@ SCENES: dict[str, Callable[[], RunSegment]] = {
     "all standing": lambda: placed([(20, 0), (40, 0), (60, 3.5)], road()),
     "all in reverse": lambda: moving(-10.0),
     "logged twice": logged_twice,
-    "the highest speed": lambda: moving(MAX_SPEED - 1, dt=0.05),
+    "the highest speed": lambda: moving(schema.MAX_SPEED - 1, dt=0.05),
     "the largest jumps": jumping,
-    "the shortest time step": lambda: moving(10.0, dt=MIN_DT),
-    "the longest time step": lambda: moving(10.0, dt=MAX_DT),
-    "the smallest boxes": lambda: with_agents(size=np.full((3, 3), MIN_SIZE, "f4")),
-    "the largest boxes": lambda: with_agents(size=np.full((3, 3), MAX_SIZE - 0.5, "f4")),
-    "headings turned often": lambda: with_agents(heading=road().heading + np.float32(MAX_HEADING - 10)),
+    "the shortest time step": lambda: moving(10.0, dt=schema.MIN_DT),
+    "the longest time step": lambda: moving(10.0, dt=schema.MAX_DT),
+    "the smallest boxes": lambda: road().replace(size=np.full((3, 3), schema.MIN_SIZE, "f4")),
+    "the largest boxes": lambda: road().replace(size=np.full((3, 3), schema.MAX_SIZE - 0.5, "f4")),
+    "headings turned often": lambda: road().replace(
+        heading=road().heading + np.float32(schema.MAX_HEADING - 10)
+    ),
     "at the edge of the world": far_away,
-    "pedestrians only": lambda: with_agents(agent_type=np.full(3, AgentType.PEDESTRIAN, np.uint8)),
-    "unknown kinds of agents": lambda: with_agents(agent_type=np.full(3, AgentType.UNSET, np.uint8)),
+    "pedestrians only": lambda: road().replace(agent_type=np.full(3, schema.AgentType.PEDESTRIAN, np.uint8)),
+    "unknown kinds of agents": lambda: road().replace(
+        agent_type=np.full(3, schema.AgentType.UNSET, np.uint8)
+    ),
     "widths and limits unknown": lambda: with_road(
         road(), lane_width=np.full(3, np.nan, "f4"), speed_limit=np.full(3, np.nan, "f4")
     ),
-    "200 lights in one place": lambda: with_lights(200, SignalState.STOP),
-    "lights of unknown state": lambda: with_lights(2, SignalState.UNKNOWN),
+    "200 lights in one place": lambda: with_lights(200, schema.SignalState.STOP),
+    "lights of unknown state": lambda: with_lights(2, schema.SignalState.UNKNOWN),
     "lights, and all leave": lambda: crossing(4, steps=STEPS, seed=3),
 }
 
@@ -172,7 +158,7 @@ SETTINGS = ("bc", "bc_ts_h", "mgail_ts_h")
 """One without search, and those that have every part, with either action space; others are simulated like them."""
 
 
-def learned(segments: Sequence[RunSegment], method: Any, out: Path) -> Agent:
+def learned(segments: Sequence[schema.RunSegment], method: Any, out: Path) -> Agent:
     """What comes of three updates, one of every kind there is, on all segments at once."""
     fill(out / "store", list(segments))
     config = tiny(
@@ -211,17 +197,17 @@ def assert_metrics_finite(agent: Agent, store: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def scenes() -> list[RunSegment]:
-    return [validate(make().replace(segment_id=name)) for name, make in SCENES.items()]
+def scenes() -> list[schema.RunSegment]:
+    return [schema.validate(make().replace(segment_id=name)) for name, make in SCENES.items()]
 
 
 @pytest.mark.parametrize("method", SETTINGS)
-def test_every_part_of_the_methods(scenes: list[RunSegment], method: str, tmp_path: Path) -> None:
+def test_every_part_of_the_methods(scenes, method, tmp_path):
     agent = learned([each for each in scenes if each.dt == 0.2], method, tmp_path)
     assert_metrics_finite(agent, tmp_path / "store")
 
 
 @pytest.mark.parametrize("dt", sorted({make().dt for make in SCENES.values()} - {0.2}))
-def test_other_time_steps(scenes: list[RunSegment], dt: float, tmp_path: Path) -> None:
+def test_other_time_steps(scenes, dt, tmp_path):
     agent = learned([each for each in scenes if each.dt == dt], "mgail_ts_h", tmp_path)
     assert_metrics_finite(agent, tmp_path / "store")

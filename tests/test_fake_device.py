@@ -4,17 +4,15 @@ are what signatures say."""
 from __future__ import annotations
 
 import runpy
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from tensordict.nn import TensorDictSequential
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorDeviceMismatchError
 
-from helpers_device import NAME, PretendDevice, on, pretend
+from helpers_device import NAME, on, pretend
 from helpers_losses import CASES, LOGGED, ROWS, SCENES, batch_of, losses, searched, spec
 from helpers_processes import forget, output_of
 from helpers_segments import crossing, straight_road
@@ -28,61 +26,36 @@ from symphony.roadgraph import LaneGraph
 from symphony.rollouts.background import CarFollower
 from symphony.rollouts.unroll import simulate, start_states
 
-EVERYTHING = ObservationConfig(
-    num_objects=3,
-    num_points=60,
-    num_lights=2,
-    route=True,
-    along=True,
-    gaps=True,
-    clearance=True,
-    foresight=(0.5, 1.0),
-)
+SEEN = {"route": True, "along": True, "gaps": True, "clearance": True, "foresight": (0.5, 1.0)}
+EVERYTHING = ObservationConfig(num_objects=3, num_points=60, num_lights=2, **SEEN)
 MANY, NOTHING = ObservationConfig(16, 4000), ObservationConfig.nothing()
-
-
 ROADS = collate([scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(), crossing(6))])
 
 
-@pytest.mark.parametrize(
-    ("config", "dynamics", "gradient"),
-    [(EVERYTHING, Displacement(), True), (MANY, Bicycle(), False), (NOTHING, Bicycle(), False)],
-)
-def test_steps_goals_and_observations_stay_on_the_device(
-    config: ObservationConfig, dynamics: Any, gradient: bool
-) -> None:
-    env = DrivingEnv(ROADS, dynamics, config)
-    with pretend() as device, torch.set_grad_enabled(gradient):
-        on(device, env)
-        number = torch.arange(2, device=device.device)[:, None].expand(2, 3)
-        start = env.start(number, number)
-        if config.route:
-            start = env.with_goals(env.choices(start))
-        out = env.step(act(env, start, gradient))["next"]
-        out = env.at(out)
-        assert {v.device.type for v in out.values(True, True)} == {NAME}
-        assert out[keys.COLLISION].shape == (2, 3, 2, 1)
-        if gradient and not dynamics.discrete and config.num_points:
-            out[keys.POINTS].sum().backward()
-        assert device.waits == []
-        assert device.constants < 7  # each is made once
-
-
-def test_steps_of_open_traffic_stay_on_the_device() -> None:
-    graphs = [(s, LaneGraph(s.road)) for s in (straight_road(), crossing(6))]
-    edges = [scene(s, [0, 1], graph, edge=map_edge(graph)) for s, graph in graphs]
-    env = DrivingEnv(collate(edges), observation=ObservationConfig.nothing())
-    assert env.open_traffic
+@contextmanager
+def placed(env, *parts):
+    """A device on which an environment and networks are, and where nothing waits or makes many constants."""
     with pretend() as device:
-        on(device, env)
-        number = torch.arange(2, device=device.device)
-        start = env.start(number, number)
-        out = env.step(act(env, start, gradient=False))["next"]
-        assert {v.device.type for v in out.values(True, True)} == {NAME}
+        for part in (*parts, env):
+            on(device, part)
+        yield device
         assert device.waits == []
+        assert device.constants < 7  # each is made once, in however many steps
 
 
-def act(env: DrivingEnv, state: Any, gradient: bool) -> Any:
+@contextmanager
+def world(space="bicycle"):
+    agent = build_agent("agent", spec(space))
+    env = DrivingEnv(SCENES, agent.dynamics, agent.observation)
+    with placed(env, *agent.modules.values()) as device:
+        yield device, agent, env
+
+
+def assert_there(td):
+    assert {value.device.type for value in td.values(True, True)} == {NAME}
+
+
+def act(env, state, gradient=False):
     shape = (*state.shape, env.num_agents)
     if env.dynamics.discrete:
         action = torch.zeros(shape, dtype=torch.int64, device=state.device)
@@ -91,7 +64,35 @@ def act(env: DrivingEnv, state: Any, gradient: bool) -> Any:
     return state.copy().set(keys.ACTION, action)
 
 
-def test_the_pretended_device_notices() -> None:
+@pytest.mark.parametrize(
+    ("config", "dynamics", "gradient"),
+    [(EVERYTHING, Displacement(), True), (MANY, Bicycle(), False), (NOTHING, Bicycle(), False)],
+)
+def test_steps_goals_and_observations_stay_on_the_device(config, dynamics, gradient):
+    env = DrivingEnv(ROADS, dynamics, config)
+    with placed(env) as device, torch.set_grad_enabled(gradient):
+        number = torch.arange(2, device=device.device)[:, None].expand(2, 3)
+        start = env.start(number, number)
+        if config.route:
+            start = env.with_goals(env.choices(start))
+        out = env.at(env.step(act(env, start, gradient))["next"])
+        assert_there(out)
+        assert out[keys.COLLISION].shape == (2, 3, 2, 1)
+        if gradient:
+            out[keys.POINTS].sum().backward()
+
+
+def test_steps_of_open_traffic_stay_on_the_device():
+    graphs = [(s, LaneGraph(s.road)) for s in (straight_road(), crossing(6))]
+    edges = [scene(s, [0, 1], graph, edge=map_edge(graph)) for s, graph in graphs]
+    env = DrivingEnv(collate(edges), observation=NOTHING)
+    assert env.open_traffic
+    with placed(env) as device:
+        number = torch.arange(2, device=device.device)
+        assert_there(env.step(act(env, env.start(number, number)))["next"])
+
+
+def test_the_pretended_device_notices():
     with pretend() as device:
         there = torch.zeros(3, device=device.device)
         with pytest.raises(FakeTensorDeviceMismatchError):
@@ -104,58 +105,36 @@ def test_the_pretended_device_notices() -> None:
         assert len(device.waits) == 2
 
 
-FEW = 7  # constants that are made once, in however many steps
-
-
-@contextmanager
-def world(space: Any = "bicycle") -> Iterator[tuple[PretendDevice, Any, DrivingEnv]]:
-    """A device, and an agent and an environment on it."""
-    agent = build_agent("agent", spec(space))
-    env = DrivingEnv(SCENES, agent.dynamics, agent.observation)
-    with pretend() as device:
-        for module in agent.modules.values():
-            on(device, module)
-        yield device, agent, on(device, env)
-
-
 @pytest.mark.parametrize("space", ["bicycle", "displacement"])
-def test_simulations_stay_on_the_device(space: Any) -> None:
-    with world(space) as (device, agent, env):
+def test_simulations_stay_on_the_device(space):
+    with world(space) as (_, agent, env):
         policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
         found = simulate(env, policy, start_states(env, agent.goals, trees=2, branches=1, seed=0))
         assert found.state.shape == (2, 2, 1, LOGGED, 2, 4)
         assert {part.device.type for part in found} == {NAME}
-        assert device.waits == []
-        assert device.constants < FEW
 
 
-def test_others_that_a_rule_drives_stay_on_the_device() -> None:
+def test_others_that_a_rule_drives_stay_on_the_device():
     scenes = SCENES.clone()
     scenes.background = scenes.interactive_valid.clone()
-    env = DrivingEnv(scenes, observation=ObservationConfig.nothing())
+    env = DrivingEnv(scenes, observation=NOTHING)
     follow = CarFollower(env)  # looks at the maps once
-    with pretend() as device:
-        on(device, env)
+    with placed(env) as device:
         follow.routes = type(follow.routes)(*(on(device, part) for part in follow.routes))
         number = torch.arange(2, device=device.device)
-        state = env.start(number, number)
-        assert follow(state)[keys.BACKGROUND].device.type == NAME
-        assert device.waits == []
-        assert device.constants < FEW
+        assert follow(env.start(number, number))[keys.BACKGROUND].device.type == NAME
 
 
-def test_searches_stay_on_the_device() -> None:
-    with world() as (device, agent, env):
+def test_searches_stay_on_the_device():
+    with world() as (_, agent, env):
         start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
         found = searched(agent, env, Systematic(0.6), start)
         assert found.trajectories.shape == (2, 1, 3, LOGGED - 1)
         assert found.totals.device.type == NAME
-        assert device.waits == []
-        assert device.constants < FEW
 
 
 @pytest.mark.parametrize("space", sorted({space for _, space in CASES}))
-def test_losses_and_their_gradients_stay_on_the_device(space: str) -> None:
+def test_losses_and_their_gradients_stay_on_the_device(space):
     with world(space) as (device, agent, env):
         row = torch.arange(ROWS, device=device.device) % 2
         batch, known = batch_of(env, env.start(row, row)), losses(agent, env)
@@ -167,10 +146,9 @@ def test_losses_and_their_gradients_stay_on_the_device(space: str) -> None:
             assert total.device.type == NAME, name
             total.backward()
             assert device.waits == [], name
-        assert device.constants < FEW
 
 
-def test_every_loss_is_among_them() -> None:
+def test_every_loss_is_among_them():
 
     with world() as (_, agent, env):
         known = {type(loss) for loss in losses(agent, env).values()}
@@ -184,8 +162,7 @@ def instrumented() -> None:
     runpy.run_module("helpers_losses", run_name="__main__")
 
 
-def test_what_is_taken_and_returned_is_what_signatures_say(tmp_path: Path) -> None:
-    """All that runs for a step and a loss, with shapes and kinds of numbers checked."""
+def test_what_is_taken_and_returned_is_what_signatures_say(tmp_path):
     # In a process of its own, as the package must be instrumented when it is imported.
     lines = output_of(instrumented, said=tmp_path / "said").splitlines()
     assert [tuple(line.split()) for line in lines] == CASES

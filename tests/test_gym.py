@@ -36,14 +36,14 @@ def store(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("action", "observation"), [("discrete", WITH_ROUTE), ("continuous", SMALL)])
-def test_gymnasiums_checker_is_content(store: Path, action: str, observation: ObservationConfig) -> None:
+def test_gymnasiums_checker_is_content(store, action, observation):
     from gymnasium.utils.env_checker import check_env
 
     env = gymnasium.make(NAME, data=store, action=action, observation=observation)
     check_env(env.unwrapped, skip_render_check=True)
 
 
-def test_it_is_the_driving_environment(store: Path) -> None:
+def test_it_is_the_driving_environment(store):
     env = gymnasium.make(NAME, data=str(store), observation=SMALL, ends_on=())
     seen, info = env.reset(seed=1, options={"segment": "crossing-0"})
     segment = SegmentStore(store)[1]
@@ -66,7 +66,7 @@ def test_it_is_the_driving_environment(store: Path) -> None:
     assert info["segment"] == "crossing-0"
 
 
-def test_the_ego_is_driven_and_reaches_what_it_hits(store: Path) -> None:
+def test_the_ego_is_driven_and_reaches_what_it_hits(store):
     """Full displacement to the side leaves the road and ends the episode."""
     env = gymnasium.make(NAME, data=store, action="continuous", observation=SMALL)
     _, start = env.reset(seed=0, options={"segment": 2})
@@ -78,7 +78,7 @@ def test_the_ego_is_driven_and_reaches_what_it_hits(store: Path) -> None:
     assert (reward, terminated, truncated, info["offroad"]) == (-1.0, True, False, True)
 
 
-def test_segments_are_drawn_by_seed_and_only_those_with_an_ego(store: Path) -> None:
+def test_segments_are_drawn_by_seed_and_only_those_with_an_ego(store):
     def drawn(seed: int) -> list[str]:
         env = gymnasium.make(NAME, data=store, observation=SMALL)
         return [env.reset(seed=seed if k == 0 else None)[1]["segment"] for k in range(8)]
@@ -96,13 +96,13 @@ def test_segments_are_drawn_by_seed_and_only_those_with_an_ego(store: Path) -> N
     assert ends == [False] * 4 + [True]
 
 
-def test_the_extra_is_named_where_it_is_missing() -> None:
+def test_the_extra_is_named_where_it_is_missing():
     code = "import sys; sys.modules['gymnasium'] = None; import symphony.gym"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "symphony-traffic[gym]" in done.stderr
 
 
-def test_a_reward_of_ones_own_and_continuous_actions_cut_to_the_space(store: Path) -> None:
+def test_a_reward_of_ones_own_and_continuous_actions_cut_to_the_space(store):
     def speed(before: Any, after: Any) -> Any:
         return after.get(keys.STATE)[..., 3]
 
@@ -119,7 +119,7 @@ def test_a_reward_of_ones_own_and_continuous_actions_cut_to_the_space(store: Pat
             env.step(np.array(action, np.float32))
 
 
-def test_actions_segments_and_arguments_that_are_none(store: Path) -> None:
+def test_actions_segments_and_arguments_that_are_none(store):
     fill(store.parent / "empty", [])
     wrong = {"discrete or continuous": {"action": "jump"}, "must not be negative": {"duration": -1.0}}
     wrong |= {"no run segments": {"data": store.parent / "empty"}}
@@ -136,7 +136,7 @@ def test_actions_segments_and_arguments_that_are_none(store: Path) -> None:
             env.step(action)
 
 
-def test_torchrl_makes_it_by_its_name(store: Path) -> None:
+def test_torchrl_makes_it_by_its_name(store):
     from torchrl.envs import GymEnv
 
     import symphony.gym  # noqa: F401

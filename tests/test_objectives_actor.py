@@ -120,7 +120,6 @@ def test_it_keeps_the_contract_of_torchrl(kind, continuous):
 
 
 def test_a_mask_counts_where_there_is_one():
-    """And must be there if it is demanded, or read by the network anyway; False never reads it."""
     td = batch(20)
     masked, bare = bc(td), td.exclude(VALID)
     everyone = bc(td, torch.ones_like(td[VALID]))

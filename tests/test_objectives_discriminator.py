@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import pytest
 import torch
 from hypothesis import given, settings
@@ -14,7 +12,6 @@ from torch import nn
 from torch.nn import functional
 
 from helpers_objectives import OBSERVATION, VALID, check_contract
-from symphony.modules import SceneEncoder, SceneNetwork, encoder, pool_elements
 from symphony.objectives import DiscriminatorLoss, auc
 
 SCORE, SIMULATED = ("agents", "score"), ("agents", "simulated")
@@ -54,7 +51,6 @@ def fixed(score, simulated, **arguments):
 
 
 def test_by_hand():
-    """Four simulated states, two logged ones."""
     probability = torch.tensor([0.5, 0.8, 0.9, 0.2, 0.1, 0.6])
     simulated = torch.tensor([True, True, True, True, False, False])
     out = fixed(probability.logit(), simulated)
@@ -65,7 +61,6 @@ def test_by_hand():
     assert out["accuracy_data"] == 0.5
     torch.testing.assert_close(out["score_simulated"], probability[:4].logit().mean())
     torch.testing.assert_close(out["score_data"], probability[4:].logit().mean())
-    # Of the eight pairs, 0.5 and 0.2 lose against 0.6.
     assert out["auc"] == 0.75
 
 
@@ -76,7 +71,6 @@ def test_it_is_cross_entropy_with_a_mean_per_kind(shape, smoothing, reduction):
     td = batch(*shape)
     out = DiscriminatorLoss(discriminator(), reduction=reduction, label_smoothing=smoothing)(td)
     logit = discriminator()(td.clone())[SCORE]
-    # Two classes, so that torch smooths the labels.
     classes = torch.stack([torch.zeros_like(logit), logit], -1).flatten(0, -2)
     how = {"label_smoothing": smoothing, "reduction": "none"}
     entropy = functional.cross_entropy(classes, td[SIMULATED].long().flatten(), **how).reshape(logit.shape)
@@ -142,40 +136,6 @@ def test_the_penalty_of_a_linear_discriminator_is_its_weight(reduction):
     (gradient,) = torch.autograd.grad(difference.sum(), net.weight)
     share = {"mean": 1.0, "sum": where.sum(), "none": where.sum()}[reduction]
     torch.testing.assert_close(gradient, share * net.weight)
-
-
-def scenes(count, elements):
-    torch.manual_seed(2)
-    td = batch(count).exclude(OBSERVATION)
-    td["agents", "own"] = torch.randn(count, 3, 5, dtype=torch.float64)
-    td["agents", "objects"] = torch.randn(count, 3, elements, 6, dtype=torch.float64)
-    td["agents", "objects_mask"] = torch.rand(count, 3, elements) < 0.5
-    return td
-
-
-def scene_discriminator():
-    torch.manual_seed(3)
-    network = SceneNetwork(SceneEncoder(5, [6], hidden=8), 1, head=(8,))
-    keys = [("agents", "own"), VALID, ("agents", "objects"), ("agents", "objects_mask")]
-    return TensorDictModule(Squeeze(network), in_keys=keys, out_keys=[SCORE]).double()
-
-
-def test_the_penalty_reaches_the_encoders_through_every_pool(monkeypatch):
-    td = scenes(12, 50)
-    assert (td[VALID] & ~td[SIMULATED]).any()
-    reference, network = scene_discriminator(), scene_discriminator()
-    for one, mode in ((reference, "dense"), (network, "winner")):
-        monkeypatch.setattr(encoder, "pool_elements", partial(pool_elements, mode=mode))
-        out = DiscriminatorLoss(one, gradient_penalty=5.0)(td)
-        out["loss_discriminator"].backward()
-    for (name, a), b in zip(reference.named_parameters(), network.parameters(), strict=True):
-        assert a.grad.norm() > 0, name
-        torch.testing.assert_close(a.grad, b.grad)
-    loss = DiscriminatorLoss(network, gradient_penalty=5.0)
-    weights = [p for name, p in loss.named_parameters() if "groups" in name and p.shape[-1] == 6]
-    assert len(weights) == 1
-    how = {"eps": 1e-7, "fast_mode": True}
-    assert torch.autograd.gradcheck(lambda *_: loss(td)["loss_discriminator"], weights, **how)
 
 
 def test_bad_inputs_are_refused():

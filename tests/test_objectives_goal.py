@@ -5,14 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import (
-    InteractionType,
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-)
+from tensordict.nn import TensorDictModule
 from torch import nn
-from torch.distributions import Categorical
 from torch.nn import functional
 
 from helpers_objectives import VALID, check_contract, learned
@@ -119,17 +113,6 @@ def test_where_nothing_counts_it_is_zero_with_zero_gradient(why):
     assert all((value == 0).all() for value in [*values, *gradients])
 
 
-def test_a_probabilistic_network_is_not_sampled_from():
-    td = batch(20)
-    how = {"distribution_class": Categorical, "default_interaction_type": InteractionType.RANDOM}
-    head = ProbabilisticTensorDictModule({"logits": LOGITS}, [LABEL], **how)
-    loss = GoalLoss(ProbabilisticTensorDictSequential(goal_network(), head))
-    state = torch.get_rng_state()
-    out = loss(td)
-    assert torch.equal(torch.get_rng_state(), state)
-    torch.testing.assert_close(out["loss_goal"], GoalLoss(goal_network())(td)["loss_goal"])
-
-
 def test_it_keeps_the_contract_of_torchrl():
     td = batch(20)
     dirty = torch.cat([td, td[:4]])
@@ -137,7 +120,6 @@ def test_it_keeps_the_contract_of_torchrl():
     dirty[LABEL] = torch.where(dirty[VALID], dirty[LABEL], 99)
     used = dirty[MASK] & counted(dirty)[..., None]
     dirty[ROUTES] = dirty[ROUTES].masked_fill(~used[..., None], 1e3)
-    # Two more goals, feasible for nobody.
     dirty[MASK] = torch.cat([dirty[MASK], torch.zeros(24, 3, 2, dtype=torch.bool)], -1)
     dirty[ROUTES] = torch.cat([dirty[ROUTES], dirty[ROUTES][..., :2, :]], -2)
 

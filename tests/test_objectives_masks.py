@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -52,7 +51,7 @@ def batch(env: DrivingEnv) -> TensorDict:
 
 
 @SPACES
-def test_padded_agents_have_no_influence_on_any_loss(space: str) -> None:
+def test_padded_agents_have_no_influence_on_any_loss(space):
     _, env, found = parts(space)
     clean, dirty = batch(env), batch(env)
     padded = ~dirty[keys.VALID]
@@ -72,8 +71,7 @@ def test_padded_agents_have_no_influence_on_any_loss(space: str) -> None:
 
 
 @SPACES
-def test_without_a_mask_no_method_trains(space: str) -> None:
-    """Though the losses do not demand one of other projects: all networks read it."""
+def test_without_a_mask_no_method_trains(space):
     _, env, found = parts(space)
     td = batch(env)
     for loss in found.values():
@@ -84,7 +82,7 @@ def test_without_a_mask_no_method_trains(space: str) -> None:
 
 
 @SPACES
-def test_what_losses_read_by_default_is_written_by_something(space: str, tmp_path: Path) -> None:
+def test_what_losses_read_by_default_is_written_by_something(space, tmp_path):
     agent, env, found = parts(space)
     fill(tmp_path / "store", SEGMENTS)
     dataset, rng = SceneDataset(SegmentStore(tmp_path / "store"), routes=True), torch.Generator()

@@ -7,11 +7,7 @@ import copy
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import (
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-)
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.nn.distributions import NormalParamExtractor
 from torch import nn
 from torch.distributions import Normal
@@ -141,7 +137,6 @@ def test_only_the_actor_receives_a_gradient(env):
     assert all(p.grad is not None and p.grad.norm() > 0 for p in policy.parameters())
     assert all(a is b and b.requires_grad for a, b in zip(before, network.parameters(), strict=True))
     assert all(p.grad is None for p in network.parameters())
-    # It can be trained right after.
     network(env.start(torch.tensor([0])))[SCORE].sum().backward()
     assert any(p.grad is not None for p in network.parameters())
 
@@ -156,7 +151,6 @@ def test_cut_at_every_step_it_is_the_sum_of_single_steps(env):
     total = sum(part[0] for part in parts), [sum(g) for g in zip(*(p[1] for p in parts), strict=True)]
     cut = make(env, reduction="sum", truncate=1)
     assert_same(value_and_gradient(cut, td), total)
-    # Cut less often, the steps between are connected.
     whole = value_and_gradient(make(env, reduction="sum"), td)
     for truncate in (1, 3):
         other = value_and_gradient(make(env, reduction="sum", truncate=truncate), td)
@@ -169,14 +163,12 @@ def test_reactions_can_be_left_out_of_the_gradient(env):
     found = [value_and_gradient(make(env, detach_keys=k), td) for k in ([], [OWN], SEEN)]
     assert_other_gradient(found[0], found[1], by=1e-6)
     assert_other_gradient(found[1], found[2], by=1e-6)
-    # A single step has no reactions.
     short = planned(env, steps=1)
     assert_same(*(value_and_gradient(make(env, detach_keys=k), short) for k in ([], SEEN)))
 
 
 @pytest.mark.parametrize("rule", [KeepAll(), KeepBest(0.5)])
 def test_the_gradient_is_that_through_the_surviving_branches(env, rule):
-    """Of a search that is run with gradients, its choices held fixed."""
     policy, network = actor(), realism()
     branch = torch.arange(4).expand(2, 4)
     start = env.start(torch.tensor([[0], [1]]).expand(2, 4), branch)
@@ -201,7 +193,6 @@ def test_scenes_padding_and_batches_add_up():
     both = value_and_gradient(make(env, reduction="sum"), td)
     parts = []
     for k, steps in enumerate((STEPS, 4)):
-        # Past the end of its scene nothing counts.
         one = planned(alone[k], 0).set(PLAN, td[PLAN][k : k + 1, :steps])
         parts.append(value_and_gradient(make(alone[k], reduction="sum"), one))
     one, other = parts
@@ -231,7 +222,6 @@ def test_the_environment_may_change_between_calls(env):
     value = loss(planned(env))["loss_mgail"]
     loss.env = other
     assert loss.env is other
-    # Also before the gradient is asked for.
     assert_same((value.detach(), torch.autograd.grad(value, list(loss.parameters()))), expected)
     td = planned(other, 1, 0, 1)
     assert_same(value_and_gradient(loss, td), value_and_gradient(make(other), td))
@@ -263,7 +253,6 @@ def test_it_keeps_the_contract_of_torchrl(agents, arguments):
     check_contract(lambda **more: walkers(agents, use_mask=True, **{**arguments, **more}), td, 4)
 
 
-# Of tensordict, about what scenes are made of.
 @pytest.mark.filterwarnings("ignore:The method <bound method TensorDictBase.__deepcopy__")
 def test_copies_have_a_discriminator_of_their_own(env):
     td, loss = planned(env), make(env)
@@ -272,7 +261,6 @@ def test_copies_have_a_discriminator_of_their_own(env):
         for p in clone.discriminator.parameters():
             p.zero_()
     assert clone(td)["mgail_score"] == 0 != loss(td)["mgail_score"]
-    # Nor is it reset with the actor.
     loss.reset_parameters_recursive()
     pairs = zip(loss.discriminator.parameters(), realism().parameters(), strict=True)
     assert all(torch.equal(*pair) for pair in pairs)
@@ -290,31 +278,6 @@ def test_bad_calls_are_refused(env):
     for bad in ({"cost": "d"}, {"horizon": -1}, {"truncate": -1}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             make(env, **bad)
-
-
-@pytest.mark.parametrize("reduction", ["mean", "sum"])
-def test_a_logit_without_agents_is_one_entry(reduction):
-    """A score [...] is the same as [..., 1], and a mask of another shape than the score is refused."""
-    env = Walk(agents=1)
-    start = starts(env, 5, branches=1)[:, 0].exclude(STREAM).set(STREAM, torch.arange(5)[:, None])
-    policy, network, found = drawing(X, ("agents",), Normal), nn.Linear(1, 1), []
-    some = torch.tensor([True, True, False, False, False])
-    for shape in ((), (1,)):
-
-        def score(x, shape=shape):
-            return network(x).reshape(*x.shape[:-2], *shape)
-
-        loss = MGAILLoss(policy, TensorDictModule(score, [X], ["score"]), env, horizon=4, reduction=reduction)
-        loss.set_keys(score="score", valid="mask")
-        values = []
-        for td in (start, start.copy().set("mask", some.reshape(5, *shape))):
-            torch.manual_seed(1)
-            values.append(loss(td)["loss_mgail"])
-        assert not torch.equal(*values)
-        found.append(values)
-        with pytest.raises(ValueError, match="shape"):
-            loss(start.copy().set("mask", torch.ones(5, 3, dtype=torch.bool)))
-    torch.testing.assert_close(*found)
 
 
 def drawing(seen, group, kind):

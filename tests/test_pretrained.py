@@ -7,7 +7,6 @@ import importlib.util
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -30,12 +29,9 @@ METHODS = ("bc_ts_h", "mgail_ts_h")
 PRUNING = EvaluateConfig(rule="best", prune_every=3)
 
 
-def load_script(name: str) -> Any:
+def load_script(name):
     spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
@@ -76,7 +72,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_an_agent_is_its_run_without_what_only_training_needs(run: Path, made: Path, tmp_path: Path) -> None:
+def test_an_agent_is_its_run_without_what_only_training_needs(run, made, tmp_path):
     assert same_weights(weights("pretrained:tiny"), weights(run))
     (checkpoint,) = checkpoints(made / "checkpoints")
     assert checkpoint.name == choose(run).name
@@ -92,16 +88,16 @@ def test_an_agent_is_its_run_without_what_only_training_needs(run: Path, made: P
         assert b"/tmp" not in content, name
     config = make_pretrained.read_run(made)
     assert (str(config.data), str(config.out)) == ("town/train", run.name)
-    assert str(config.warm_start) == make_pretrained.read_run(run).warm_start.name  # type: ignore[union-attr]
+    assert str(config.warm_start) == make_pretrained.read_run(run).warm_start.name
 
 
-def test_the_same_run_gives_the_same_bytes(run: Path, made: Path, tmp_path: Path) -> None:
+def test_the_same_run_gives_the_same_bytes(run, made, tmp_path):
     torch.manual_seed(5)
     again = make_pretrained.make(str(run), "tiny", pruning=PRUNING, folder=tmp_path / "again")
     assert contents(again) == contents(made)
 
 
-def test_the_command_prints_every_card(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_every_card(made, capsys):
     assert main(["agents", "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out) == {"agents": [pretrained.read_card(made)]}
     assert main(["agents"]) == 0
@@ -116,19 +112,19 @@ def test_the_command_prints_every_card(made: Path, capsys: pytest.CaptureFixture
     assert "no model card" in capsys.readouterr().err
 
 
+OTHERS = "there are: pretrained:other, pretrained:tiny"
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        (
-            "pretrained:tinny",
-            "did you mean 'pretrained:tiny'\\? there are: pretrained:other, pretrained:tiny",
-        ),
-        ("pretrained:", "no agent 'pretrained:' comes with this package; there are: pretrained:other"),
+        ("pretrained:tinny", f"did you mean 'pretrained:tiny'\\? {OTHERS}"),
+        ("pretrained:", f"no agent 'pretrained:' comes with this package; {OTHERS}"),
         ("pretrained:../pretrained/tiny", "no agent"),
         ("pretrained:tiny@3", "has no checkpoint yet"),
     ],
 )
-def test_unknown_names(name: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_names(name, message, tmp_path, monkeypatch):
     monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
     for known in ("tiny", "other"):
         (tmp_path / known).mkdir()
@@ -140,7 +136,7 @@ def test_unknown_names(name: str, message: str, tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped(name: str) -> None:
+def test_shipped(name):
     agent = load_agent(f"pretrained:{name}")
     folder = pretrained.FOLDER / name
     config = make_pretrained.read_run(folder)

@@ -10,7 +10,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers_roadgraph import arc, crossing, drive, fork, make_road, roundabout, straight
+from helpers_roadgraph import arc, crossing, drive, fork, make_road, roundabout
 from symphony.errors import DataError
 from symphony.roadgraph import LaneGraph, lane_of, starting_lanes, visited_regions
 
@@ -19,7 +19,6 @@ def test_regions_of_a_crossing():
     road, name = crossing()
     regions = LaneGraph(road).regions
     assert len(regions) == 12
-    # Of every choice there are three.
     assert np.unique(regions.parent, return_counts=True)[1].tolist() == [3] * 4
     by_lane = dict(zip(regions.lane.tolist(), range(12), strict=True))
     left, ahead, right = (by_lane[name[f"{k}1"]] for k in ("left", "ahead", "right"))
@@ -82,16 +81,10 @@ def test_what_is_not_finite_is_on_no_lane_and_not_silently(number):
             lane_of(graph, states[:, :2], states[:, 2])
         with pytest.raises(ValueError, match="not finite"):
             starting_lanes(graph, np.array(vehicle[:2]), vehicle[2])
-
-
-def test_heading_decides_between_overlapping_lanes():
-    lines = {"east": straight((-20, 0), (20, 0)), "slant": straight((-20, -10), (20, 10))}
-    road, name = make_road(lines)
-    graph = LaneGraph(road)
-    assert lane_of(graph, [0, 0], 0.0) == name["east"]
-    assert lane_of(graph, [0, 0], np.arctan2(10, 20)) == name["slant"]
-    twin, _ = make_road({"a": lines["east"], "b": lines["east"]})
-    assert lane_of(LaneGraph(twin), [0, 0.5], 0.0) == 0
+        path = np.zeros((5, 3))
+        path[3] = vehicle
+        with pytest.raises(ValueError, match="must be finite"):
+            visited_regions(graph, path[:, :2], path[:, 2], np.ones(5, bool))
 
 
 @settings(max_examples=20, deadline=None)
@@ -135,27 +128,15 @@ def test_starting_lanes_around_a_junction():
     assert dict(inside)[name["ahead0"]] == pytest.approx(2)
     late = starting_lanes(graph, [2, 5], np.pi / 2)
     assert late[0][0] == name["ahead0"]
-    # Only lanes that merge ahead are as near.
     assert all(graph.successors[k] == (name["out2"],) for k, _ in late)
     # Cutting into a turn, a vehicle may be nearer to another connector than to its own by a metre.
     wide = starting_lanes(graph, [1.5, -4.5], np.radians(110))
     assert {k for k, _ in wide} >= {name["left0"], name["ahead0"]}
 
 
-MOVES = [(kind, k) for k in range(4) for kind in ("left", "ahead", "right")]
-EXIT = {"left": 3, "ahead": 2, "right": 1}
-
-
-def lanes_visited(graph, name, position, heading, valid=None):
-    valid = np.ones(len(position), bool) if valid is None else valid
-    found = visited_regions(graph, position, heading, valid)
-    back = {k: lane for lane, k in name.items()}
-    return sorted(back[k] for k in graph.regions.lane[found])
-
-
 def movement(graph, name, kind, k, **options):
-    lanes = (f"in{k}", f"{kind}{k}", f"out{(k + EXIT[kind]) % 4}")
-    return drive(*(graph.lines[name[lane]] for lane in lanes), **options)
+    end = (k + {"left": 3, "ahead": 2, "right": 1}[kind]) % 4
+    return drive(*(graph.lines[name[lane]] for lane in (f"in{k}", f"{kind}{k}", f"out{end}")), **options)
 
 
 def test_invalid_states_are_bridged_and_never_read():
@@ -165,50 +146,26 @@ def test_invalid_states_are_bridged_and_never_read():
     valid = np.ones(len(position), bool)
     valid[114:124] = False
     position[~valid], heading[~valid] = np.nan, np.nan
-    assert lanes_visited(graph, name, position, heading, valid) == ["left0"]
-    assert lanes_visited(graph, name, position, heading, np.zeros_like(valid)) == []
+    found = visited_regions(graph, position, heading, valid)
+    assert graph.regions.lane[found].tolist() == [name["left0"]]
+    assert not visited_regions(graph, position, heading, np.zeros_like(valid)).any()
 
 
-def random_batch(graph, name, seed=0, shape=(3, 4), steps=60):
-    rng = np.random.default_rng(seed)
-    position, heading = np.zeros((*shape, steps, 2)), np.zeros((*shape, steps))
-    for i in np.ndindex(shape):
-        kind, k = MOVES[rng.integers(12)]
-        p, h = movement(graph, name, kind, k, step=rng.uniform(0.5, 2.5), offset=rng.normal(0, 0.3))
-        first = rng.integers(0, len(p) - 5)
-        take = np.clip(np.arange(first, first + steps), None, len(p) - 1)
-        position[i], heading[i] = p[take], h[take]
-    return position, heading, rng.random((*shape, steps)) < 0.9
-
-
-@pytest.mark.parametrize("part", [0, 1])
-def test_a_valid_state_that_is_not_finite_is_refused(part):
-    road, _ = crossing()
-    path = [np.zeros((5, 2)), np.zeros(5)]
-    path[part][3] = np.nan
-    with pytest.raises(ValueError, match="must be finite"):
-        visited_regions(LaneGraph(road), *path, np.ones(5, bool))
-
-
-def test_trajectories_that_share_a_history_or_stand_equal_each_alone(monkeypatch):
+def test_trajectories_that_share_a_history_or_stand_equal_each_alone():
     road, name = crossing()
     graph = LaneGraph(road)
-    position, heading, valid = random_batch(graph, name, shape=(4,))
-    history = (p[[0, 0, 0, 1, 2, 3, 3]].copy() for p in (position, heading, valid))
-    position, heading, valid = history
+    rng, paths = np.random.default_rng(0), []
+    for kind, k in (("left", 0), ("right", 1), ("ahead", 2), ("left", 3)):
+        path = movement(graph, name, kind, k, step=1.5, offset=rng.normal(0, 0.3))
+        paths.append([part[20:80] for part in path])
+    position, heading = (np.stack([paths[k][part] for k in (0, 0, 0, 1, 2, 3, 3)]) for part in (0, 1))
+    valid = rng.random(heading.shape) < 0.9
     position[1, 30:], heading[1, 30:] = position[3, 30:], heading[3, 30:]
     heading[2, 30:] += np.pi  # in the same places, the other way
     position[4, 20:], heading[4, 20:] = position[4, 20], heading[4, 20]
     position[5] = position[6, ::-1]
-    looked, near = [], type(graph.region_index).near
-    monkeypatch.setattr(
-        type(graph.region_index),
-        "near",
-        lambda index, points, reach: looked.append(points) or near(index, points, reach),
-    )
     together = visited_regions(graph, position, heading, valid)
     assert together.any()
-    assert len(looked[0]) == len(np.unique(position[valid], axis=0)) < valid.sum()
     for i in range(len(valid)):
         np.testing.assert_array_equal(together[i], visited_regions(graph, position[i], heading[i], valid[i]))
 
@@ -270,7 +227,6 @@ def test_agrees_with_the_definition(make):
     rng = np.random.default_rng(5)
     hits = 0
     for _ in range(20):
-        # A loose walk along the lanes, and now and then none.
         lane, path = rng.integers(len(graph)), []
         for _ in range(rng.integers(1, 9)):
             path.append(graph.lines[lane])

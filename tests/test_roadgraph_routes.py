@@ -12,35 +12,14 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers_roadgraph import (
-    crossing,
-    drive,
-    merge,
-    moved_road,
-    parallel,
-    pocket,
-    roundabout,
-    tree,
-    turned,
-)
+from helpers_roadgraph import crossing, drive, merge, moved_road, parallel, pocket, roundabout, tree, turned
 from helpers_segments import make_road
-from symphony.roadgraph import (
-    LaneGraph,
-    Route,
-    blend,
-    route_line,
-    route_lines,
-    routes,
-)
+from symphony.roadgraph import LaneGraph, Route, blend, route_line, route_lines, routes
 from symphony.roadgraph import ground_truth_routes as ground_truth
 from symphony.roadgraph.paths import arc_lengths, at, beside, distinct, sharpest
 from symphony.roadgraph.routes import MAX_LANES, change_length, ends_inside, resampled, route_errors
 
 SPACING = 1.0
-
-
-def named(name, *lanes):
-    return tuple(name[k] for k in lanes)
 
 
 def lanes_of(found):
@@ -67,9 +46,9 @@ def test_crossing_has_three_routes_from_each_arm():
     for k in range(4):
         found = routes(graph, [(name[f"in{k}"], 10.0)])
         expected = {
-            named(name, f"in{k}", f"left{k}", f"out{(k + 3) % 4}"),
-            named(name, f"in{k}", f"ahead{k}", f"out{(k + 2) % 4}"),
-            named(name, f"in{k}", f"right{k}", f"out{(k + 1) % 4}"),
+            (name[f"in{k}"], name[f"left{k}"], name[f"out{(k + 3) % 4}"]),
+            (name[f"in{k}"], name[f"ahead{k}"], name[f"out{(k + 2) % 4}"]),
+            (name[f"in{k}"], name[f"right{k}"], name[f"out{(k + 1) % 4}"]),
         }
         assert set(lanes_of(found)) == expected
         assert found == sorted(found)
@@ -85,7 +64,6 @@ def test_roundabout_ends_by_the_horizon():
         reach = graph.length[list(route)].sum()
         assert reach >= 200 or not graph.successors[route[-1]]
         assert reach - graph.length[route[-1]] < 200
-    # Round and round: some route passes one lane twice.
     assert any(
         len(set(route)) < len(route)
         for route in lanes_of(routes(graph, [(name["entry0"], 0.0)], horizon=400))
@@ -117,11 +95,11 @@ def test_routes_do_not_depend_on_the_order_of_connections():
 def test_pocket_is_reached_by_a_change_where_it_begins():
     road, name = pocket()
     graph = LaneGraph(road)
-    plain = Route(named(name, "first", "second", "third", "on"))
-    turn = Route(named(name, "first", "second", "third", "pocket", "turn"), 3, 0.0, 0.0)
+    plain = Route((name["first"], name["second"], name["third"], name["on"]))
+    turn = Route((name["first"], name["second"], name["third"], name["pocket"], name["turn"]), 3, 0.0, 0.0)
     assert routes(graph, [(name["first"], 0.0)]) == [plain, turn]
     assert routes(graph, [(name["first"], 0.0)], limit=1) == [plain]
-    assert lanes_of(routes(graph, [(name["first"], 0.0)], horizon=100)) == [named(name, "first", "second")]
+    assert lanes_of(routes(graph, [(name["first"], 0.0)], horizon=100)) == [(name["first"], name["second"])]
     line = route_line(graph, turn)
     # Up to the pocket on the lane, in the pocket after the length of a change.
     away = [abs(y) for x, y in line if x <= 100] + [abs(y - 3.5) for x, y in line if 120 <= x <= 150]
@@ -133,10 +111,11 @@ def test_parallel_lanes_offer_one_change_not_one_per_piece():
     graph = LaneGraph(road)
     for own, other in ("ab", "ba"):
         found = routes(graph, [(name[f"{own}0"], 5.0)])
-        plain = Route(named(name, f"{own}0", f"{own}1", f"{own}2"))
-        changed = Route(named(name, f"{own}0", f"{other}0", f"{other}1", f"{other}2"), 1, 5.0, 5.0)
+        plain = Route((name[f"{own}0"], name[f"{own}1"], name[f"{own}2"]))
+        changed = Route(
+            (name[f"{own}0"], name[f"{other}0"], name[f"{other}1"], name[f"{other}2"]), 1, 5.0, 5.0
+        )
         assert found == [plain, changed]
-    # Whoever may be on either lane needs no change.
     assert len(routes(graph, [(name["a0"], 5.0), (name["b0"], 5.0)])) == 2
 
 
@@ -180,7 +159,6 @@ def test_ground_truth_ties_and_empty_logs():
     found = routes(graph, [(name["in0"], 0.0)])
     log = np.stack((np.full(5, 2.0), np.linspace(-60, -50, 5)), -1)
     assert len(found) > 1
-    # The log ends before the routes part, so that each of them is as right as the others.
     assert ground_truth_routes(graph, found, log, np.ones(5, bool)).all()
     assert ground_truth_routes(graph, found, log, np.zeros(5, bool)).all()
     with pytest.raises(ValueError, match="no routes"):
@@ -216,7 +194,6 @@ def test_a_blend_leads_forward_onto_the_line_without_a_kink(curvature, aside, pl
     stations = np.array([beside(line, here)[0] for here in way])
     away = np.array([beside(line, here)[1] for here in way])
     assert (np.diff(stations) > 0).all()
-    # It comes nearer and nearer, and is on the line by its length.
     assert (np.diff(away) < 0.02).all()
     assert away[stations > stations[0] + length + 0.1].max(initial=0.0) < 1e-6
     # 1.5 d / length is the steepest of it, and a line of radius r turns by 3 / (r - d) where it is that much inside.
