@@ -126,14 +126,9 @@ def test_trajectories_are_complete_and_stop_at_their_end():
 @pytest.mark.parametrize("options", [{}, {"init_random_frames": FRAMES}])
 def test_random_actions(options):
     env = with_rows(PendulumEnv(seed=0), [ROWS])
-    settings = {
-        "score": KeyScore("reward", negate=True),
-        "branches": 4,
-        "frames_per_batch": FRAMES,
-        **options,
-    }
+    how = {"score": KeyScore("reward", negate=True), "branches": 4, "frames_per_batch": FRAMES, **options}
     policy = (lambda td: td.set("action", torch.full((*td.shape, 1), 9.0))) if options else None
-    collector = BeamSearchCollector(env, policy, total_frames=2 * FRAMES, **settings)
+    collector = BeamSearchCollector(env, policy, total_frames=2 * FRAMES, **how)
     first, second = (batch.get("action") for batch in collector)
     assert first.abs().max() <= 2
     assert len(first.unique()) > FRAMES / 2

@@ -19,6 +19,7 @@ from symphony import collectors
 from symphony.collectors.rules import checked
 
 STEPS, KEPT, SPREAD = 8, 0.9, 0.5
+TOTAL = collectors.Aggregate("sum")
 SCHEMES = (collectors.Systematic, collectors.Stratified, collectors.Residual)
 
 
@@ -70,12 +71,7 @@ def filtered(y: Tensor, rule: Any, branches: int, **how: Any) -> collectors.Beam
         {"x": torch.zeros(rows, 1), "t": torch.zeros(rows, 1, dtype=torch.int64), "y": y}, [rows]
     )
     noise = torch.rand(rows, STEPS, *([branches] if rule.noise_per_slot else []))
-    how |= {
-        "steps": STEPS,
-        "prune_every": 1,
-        "aggregate": collectors.Aggregate("sum"),
-        "keep": [("next", "x")],
-    }
+    how |= {"steps": STEPS, "prune_every": 1, "keep": [("next", "x")], "aggregate": TOTAL}
 
     def policy(td: TensorDictBase) -> TensorDictBase:
         return td.set("action", torch.randn(*td.shape, 1))
@@ -162,15 +158,10 @@ def test_what_follows_an_end_changes_nothing(rule, agents, time):
             return torch.where(over, garbage, -td.get((*group, "reward")).squeeze(-1))
 
         env, noise = Mass(agents=agents, sticky=sticky), torch.full((20, 4), 0.3)
-        how |= {
-            "steps": 12,
-            "prune_every": 3,
-            "rule": rule,
-            "aggregate": collectors.Aggregate(time),
-            "noise": noise,
-        }
+        how |= {"steps": 12, "prune_every": 3, "rule": rule, "noise": noise, "aggregate": whole}
         return collectors.beam_search(env, policy, score, start, **how)
 
+    whole = collectors.Aggregate(time)
     results = [found(sticky, garbage) for sticky in (True, False) for garbage in (0.0, 1e4, -1e4)]
     for one in results[1:]:
         for name in ("scores", "totals", "parents", "slots", "alive"):
@@ -279,18 +270,10 @@ def test_replace_bad_by_hand(branches, threshold, noise, grouped):
     assert parents[0].tolist() == replaced(totals[0].tolist(), threshold, noise, groups)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        (collectors.KeepBest, 0.0),
-        (collectors.KeepBest, 1.1),
-        (collectors.KeepBest, math.nan),
-        (collectors.Systematic, 0.0),
-    ],
-)
-def test_bad_parameters_are_errors(wrong):
-    rule, value = wrong
-    with pytest.raises(ValueError, match=r"fraction|temperature"):
-        rule(value)
+def test_bad_parameters_are_errors():
+    best, systematic = collectors.KeepBest, collectors.Systematic
+    for rule, value in ((best, 0.0), (best, 1.1), (best, math.nan), (systematic, 0.0)):
+        with pytest.raises(ValueError, match=r"fraction|temperature"):
+            rule(value)
     with pytest.raises(ValueError, match="threshold"):
         collectors.ReplaceBad(math.nan)

@@ -394,11 +394,8 @@ def test_who_enters_would_meet_nobody_within_a_second(ahead, aside, speed, its_s
         torch.cat([place, torch.tensor([angle]), v * forward])
         for place, v in ((0 * forward, speed), (ahead * forward + aside * left, its_speed))
     ]
-    objects = Objects(
-        torch.stack(rows)[None].float(),
-        torch.ones(1, 2, dtype=torch.bool),
-        torch.tensor([[[4.5, 2.0], [4.5, 2.0]]]),
-    )
+    size = torch.tensor([[[4.5, 2.0], [4.5, 2.0]]])
+    objects = Objects(torch.stack(rows)[None].float(), torch.ones(1, 2, dtype=torch.bool), size)
     for index, slot in (([[0]], 0), ([[1, 0]], 1)):
         ready = torch.zeros(1, len(index[0]), dtype=torch.bool)
         ready[0, slot] = True

@@ -161,15 +161,10 @@ SETTINGS = ("bc", "bc_ts_h", "mgail_ts_h")
 def learned(segments: Sequence[schema.RunSegment], method: Any, out: Path) -> Agent:
     """What comes of three updates, one of every kind there is, on all segments at once."""
     fill(out / "store", list(segments))
-    config = tiny(
-        method,
-        out / "store",
-        out / "run",
-        steps=3,
-        segments=2 * len(segments),
-        agent=AgentConfig(interactive=1, num_points=12, hidden=8),
-        mgail=MGAILConfig(regression=1, head_start=1, rollouts=len(segments), expert_weight=0.5),
-    )
+    agent = AgentConfig(interactive=1, num_points=12, hidden=8)
+    mgail = MGAILConfig(regression=1, head_start=1, rollouts=len(segments), expert_weight=0.5)
+    how = {"steps": 3, "segments": 2 * len(segments), "agent": agent, "mgail": mgail}
+    config = tiny(method, out / "store", out / "run", **how)
     trainer = build(config)
     for step in range(3):
         values = trainer._update(step)

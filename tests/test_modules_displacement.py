@@ -59,14 +59,8 @@ def test_tensor_arithmetic_equals_unbounded_integers(seed, stream, step):
 
 def test_streams_keep_the_numbers_that_rollouts_were_made_with():
     first = 1 << 40
-    assert {stream.name: stream - first for stream in Stream} == {
-        "GOALS": 0,
-        "PRUNING": 1,
-        "PLANNERS": 3,
-        "PERSONAS": 4,
-        "WALKS": 5,
-        "BACKTRACKING": first,
-    }
+    kept = {"GOALS": 0, "PRUNING": 1, "PLANNERS": 3, "PERSONAS": 4, "WALKS": 5, "BACKTRACKING": first}
+    assert {stream.name: stream - first for stream in Stream} == kept
 
 
 def test_a_name_has_the_same_stream_in_every_process():
@@ -269,11 +263,14 @@ def test_the_density_integrates_to_one_and_is_that_of_the_draws(pace):
     torch.testing.assert_close(drawn[drawn[:, 0] >= LEAST].sum(0) / len(drawn), expected, rtol=0, atol=5e-3)
 
 
+shares_inside = st.floats(2**-24, 1 - 2**-24)
+
+
 @settings(max_examples=60)
 @given(
     st.lists(st.floats(-80, 80), min_size=F * L, max_size=F * L),
-    st.floats(2**-24, 1 - 2**-24),
-    st.floats(2**-24, 1 - 2**-24),
+    shares_inside,
+    shares_inside,
     st.floats(0, 8),
 )
 def test_any_numbers_give_a_displacement(logits, first, second, pace):

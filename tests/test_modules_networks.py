@@ -62,16 +62,11 @@ def test_values_and_gradients_equal_an_elementwise_reference(mode, dtype, tolera
     torch.testing.assert_close(again, pooled.detach(), rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize(
-    "network",
-    [
-        nn.Linear(3, 4),
-        nn.Sequential(nn.Linear(3, 4, bias=False), nn.Tanh()),
-        modules.mlp((3, 4)),
-        modules.mlp((3, 5, 4)),
-        modules.mlp((3, 4, 6, 4)),
-    ],
-)
+UNEVEN = nn.Sequential(nn.Linear(3, 4, bias=False), nn.Tanh())
+LAYERS = [(3, 4), (3, 5, 4), (3, 4, 6, 4)]
+
+
+@pytest.mark.parametrize("network", [nn.Linear(3, 4), UNEVEN, *map(modules.mlp, LAYERS)])
 @pytest.mark.parametrize("mode", ["dense", "winner"])
 def test_gradcheck_for_any_row_wise_function(network, mode):
     torch.manual_seed(1)
@@ -107,12 +102,8 @@ def test_order_and_padding_of_the_elements_change_nothing(seed, extra):
     shuffled = results(network, elements[:, order], mask[:, order], "winner")
     shuffled[1] = shuffled[1][:, order.argsort()]
     padding = torch.full((3, extra, elements.shape[2]), 1e6, dtype=elements.dtype)
-    padded = results(
-        network,
-        torch.cat([padding, elements], 1),
-        torch.cat([torch.zeros(3, extra, dtype=torch.bool), mask], 1),
-        "winner",
-    )
+    wider = torch.cat([padding, elements], 1), torch.cat([padding[..., 0] < 0, mask], 1)
+    padded = results(network, *wider, "winner")
     padded[1] = padded[1][:, extra:]
     for other in (shuffled, padded):
         for a, b in zip(base, other, strict=True):

@@ -280,20 +280,16 @@ def test_bad_calls_are_refused(env):
             make(env, **bad)
 
 
-def drawing(seen, group, kind):
-    """An actor that draws from a normal distribution."""
-    torch.manual_seed(0)
-    size, names = (1 if group else 2), [(*group, "loc"), (*group, "scale")]
-    net = nn.Sequential(nn.Linear(size, 2), NormalParamExtractor())
-    head = ProbabilisticTensorDictModule(
-        names, [(*group, "action")], distribution_class=kind, default_interaction_type="random"
-    )
-    return ProbabilisticTensorDictSequential(TensorDictModule(net, [seen], names), head)
-
-
 def test_an_episode_ends_once():
     """An environment that comes back into its bounds is scored like one that stays out."""
-    policy = drawing("place", (), IndependentNormal)
+    torch.manual_seed(0)
+    names, how = (
+        ["loc", "scale"],
+        {"distribution_class": IndependentNormal, "default_interaction_type": "random"},
+    )
+    body = TensorDictModule(nn.Sequential(nn.Linear(2, 2), NormalParamExtractor()), ["place"], names)
+    head = ProbabilisticTensorDictModule(names, ["action"], **how)
+    policy = ProbabilisticTensorDictSequential(body, head)
     far = TensorDictModule(lambda place: place[..., 0].abs(), ["place"], ["score"])
     start = with_rows(Mass(), [30]).reset()
     values = []
