@@ -49,7 +49,7 @@ def test_corner_order():
     assert shapely.LinearRing(corners.numpy()).is_ccw
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(box, box)
 @example((0.0, 0.0, 0.0, 4.0, 2.0), (4.0, 1.0, math.pi / 2, 2.0, 4.0))  # they touch
 @example(
