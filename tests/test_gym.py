@@ -141,5 +141,5 @@ def test_torchrl_makes_it_by_its_name(store):
 
     import symphony.gym  # noqa: F401
 
-    env = GymEnv("symphony/Driving-v0", data=str(store), observation=SMALL)
+    env = GymEnv("symphony/Driving-v0", data=str(store), observation=SMALL, ends_on=())
     assert env.rollout(3)["next", "own"].shape == (3, 4)
