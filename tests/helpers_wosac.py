@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ def made_scenario(agents: int = 4, seed: int = 0, **changes: Any) -> WosacScenar
     speed = 5 + rng.random((agents, 1)) * 5
     x = speed * step + rng.random((agents, 1)) * 10
     position = np.stack((x, np.broadcast_to(4.0 * np.arange(agents)[:, None], x.shape), np.zeros_like(x)), -1)
-    arrays: dict[str, Any] = {
+    arrays = {
         "object_id": 10 + np.arange(agents),
         "object_type": np.ones(agents, int),
         "position": position,
@@ -45,12 +44,9 @@ def made_scenario(agents: int = 4, seed: int = 0, **changes: Any) -> WosacScenar
     return WosacScenario("made", **{**arrays, **changes})
 
 
-def made_rollouts(
-    scenario: WosacScenario, count: int = 3, noise: float = 0.3, seed: int = 1
-) -> SimulatedRollouts:
+def made_rollouts(scenario: WosacScenario, count: int = 3, noise: float = 0.3) -> SimulatedRollouts:
     """The log with noise, for every agent that is valid at step 10."""
-    rng = np.random.default_rng(seed)
-    rows = scenario.valid[:, 10]
+    rng, rows = np.random.default_rng(1), scenario.valid[:, 10]
     future = scenario.position[rows, 11:]
     states = future[None] + rng.normal(0, noise, (count, *future.shape))
     heading = scenario.heading[rows, 11:] + rng.normal(0, noise / 5, (count, *future.shape[:-1]))
@@ -67,15 +63,8 @@ def womd_record(name: str = "0123456789abcdef", tracks: int = 3) -> pb.Scenario:
 
 def record_rollouts(scenario: pb.Scenario, count: int = 32, seed: int = 0) -> SimulatedRollouts:
     """Log playback of a record with a little noise."""
-    rng = np.random.default_rng(seed)
-    logged = np.array(
-        [[(s.center_x, s.center_y, s.center_z, s.heading) for s in t.states[11:]] for t in scenario.tracks]
-    )
-    states = logged + rng.normal(0, 0.1, (count, *logged.shape))
+    rng, names = np.random.default_rng(seed), ("center_x", "center_y", "center_z", "heading")
+    logged = [[[getattr(s, name) for name in names] for s in track.states[11:]] for track in scenario.tracks]
+    states = np.array(logged) + rng.normal(0, 0.1, (count, *np.shape(logged)))
     ids = np.array([track.id for track in scenario.tracks])
     return SimulatedRollouts(ids, *np.moveaxis(states.astype(np.float32), -1, 0))
-
-
-def write_rollouts(file: Path, rollouts: SimulatedRollouts) -> None:
-    """Write a file that ``symphony wosac score`` reads."""
-    np.savez(file, **vars(rollouts))

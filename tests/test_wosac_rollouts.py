@@ -1,10 +1,10 @@
-"""Rollouts for the WOSAC score: of WOMD scenarios as a submission, of any run segment for its score."""
+"""Rollouts for the WOSAC score: of WOMD scenarios as a submission, of any run segment or store for its score."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,17 +14,22 @@ from hypothesis import strategies as st
 
 from helpers_agents import small
 from helpers_segments import crossing, hide, straight_road
+from helpers_store import fill
 from helpers_wosac import womd_record
 from symphony.agents import load_agent
 from symphony.cli import main
-from symphony.config import WosacSettings
+from symphony.config import EvaluateConfig, WosacSettings
 from symphony.data.resample import resample, wrap
-from symphony.data.segment import AgentType, RunSegment, SignalState, validate
-from symphony.data.sources import womd_pb2 as pb
+from symphony.data.segment import AgentType, SignalState, validate
 from symphony.data.sources.tfrecord import write_records
 from symphony.data.sources.womd import scenario_to_segment
-from symphony.errors import ConfigError, DataError
+from symphony.data.store import SegmentStore
+from symphony.errors import ConfigError, DataError, SymphonyError
+from symphony.evaluation.table import WOSAC, Entry, compare
 from symphony.rollouts.driving import simulation
+from symphony.wosac.bystanders import AHEAD, COURSE, PACE, standing, walks
+from symphony.wosac.evaluate import evaluate_wosac, simulated_how
+from symphony.wosac.passing import order_of, passing_gaps, passing_pairs
 from symphony.wosac.records import logged_scenario, parse_scenario, read_scenarios
 from symphony.wosac.scorer import SimulatedRollouts, compute_features, score
 from symphony.wosac.scorer.scenario import STATES
@@ -37,18 +42,22 @@ from symphony.wosac.simulate import (
     wosac_rollouts,
 )
 from symphony.wosac.submission import check_submission, required_agents
+from symphony.wosac.table import COLUMNS, read_wosac, wosac_table
+from test_selection import CASES, scene
 
 AGENT = "pretrained:bc_ts_h"
+RANDOM = "random"
 PLAIN = WosacSettings(search="none")
 SEARCH = WosacSettings(search="tree", branches=2)
-NO = ("uses-lidar-data", "uses-camera-data", "uses-public-model-pretraining")
-TEXTS = {"account-name": "somebody@example.org", "unique-method-name": "made", "num-model-parameters": "200K"}
-YES = {"acknowledge-complies-with-closed-loop-requirement": "True"}
-ANSWERS = {**TEXTS, **dict.fromkeys(NO, "False"), **YES}
-META = [word for name, answer in ANSWERS.items() for word in (f"--{name}", answer)]
+TOLD = """
+--account-name somebody@example.org --unique-method-name made --num-model-parameters 200K --uses-lidar-data False
+--uses-camera-data False --uses-public-model-pretraining False
+--acknowledge-complies-with-closed-loop-requirement True
+"""
+META = TOLD.split()
 
 
-def mixed_record(name: str = "0123456789abcdef") -> pb.Scenario:
+def mixed_record(name="0123456789abcdef"):
     """Three vehicles, a pedestrian, and a vehicle that is not there at step 10."""
     record = womd_record(name, tracks=5)
     record.tracks[0].object_type = AgentType.PEDESTRIAN
@@ -56,31 +65,25 @@ def mixed_record(name: str = "0123456789abcdef") -> pb.Scenario:
     return record
 
 
-def mixed_segment() -> RunSegment:
+def mixed_segment():
     return validate(scenario_to_segment(mixed_record()))
 
 
-def same(a: SimulatedRollouts, b: SimulatedRollouts) -> bool:
+def same(a, b):
     return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("object_id", *STATES))
 
 
-def write(path: Path, *records: pb.Scenario) -> Path:
-    write_records(path, [record.SerializeToString() for record in records])
-    return path
-
-
-# --- simulation ---
+def submitted(data, out, *more):
+    return main(["wosac", "submit", *more, "--data", str(data), "--out", str(out), *META])
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 0.2, 0.25, 0.4]))
-def test_states_between_decisions_are_those_of_resampling(seed: int, dt: float) -> None:
+def test_states_between_decisions_are_those_of_resampling(seed, dt):
     segment, rng = straight_road(num_agents=2, steps=round(8 / dt) + 1, dt=dt), np.random.default_rng(seed)
-    shape = segment.heading.shape
-    segment = segment.replace(
-        position=rng.normal(0, 30, (*shape, 3)).astype(np.float32),
-        heading=rng.uniform(-10, 10, shape).astype(np.float32),
-    )
-    states = np.concatenate([segment.position[..., :2], segment.heading[..., None]], -1).astype(np.float64)
+    position = rng.normal(0, 30, segment.position.shape).astype(np.float32)
+    heading = rng.uniform(-10, 10, segment.heading.shape).astype(np.float32)
+    segment = segment.replace(position=position, heading=heading)
+    states = np.concatenate([position[..., :2], heading[..., None]], -1).astype(np.float64)
     found = between_decisions(states.swapaxes(0, 1)[None], dt)[0]
     expected = segment if dt == 0.1 else resample(segment, 0.1)
     np.testing.assert_allclose(found[..., :2], expected.position[:, 1:, :2], atol=1e-4)
@@ -89,7 +92,7 @@ def test_states_between_decisions_are_those_of_resampling(seed: int, dt: float) 
 
 
 @pytest.mark.parametrize("settings", [PLAIN, SEARCH], ids=["none", "tree"])
-def test_nothing_of_the_future_is_used(settings: WosacSettings) -> None:
+def test_nothing_of_the_future_is_used(settings):
     agent, segment, settings = small(), mixed_segment(), replace(settings, horizon=2.0)
     later = np.arange(segment.num_steps) > 10
     other = segment.replace(
@@ -102,14 +105,11 @@ def test_nothing_of_the_future_is_used(settings: WosacSettings) -> None:
     found = wosac_rollouts(agent, segment, settings)
     assert same(found, wosac_rollouts(agent, other, settings))
     # The present is used.
-    moved = segment.replace(velocity=0.5 * segment.velocity)
-    assert not same(found, wosac_rollouts(agent, moved, settings))
+    assert not same(found, wosac_rollouts(agent, segment.replace(velocity=0.5 * segment.velocity), settings))
 
 
 @pytest.mark.parametrize("settings", [PLAIN, SEARCH], ids=["none", "tree"])
-def test_vehicles_are_driven_and_people_walk_on(
-    settings: WosacSettings, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_vehicles_are_driven_and_people_walk_on(settings, monkeypatch):
     # Trees are independent, however many are searched at a time.
     monkeypatch.setattr("symphony.wosac.simulate.AT_ONCE", 12 * 2 * 3)
     segment, settings = mixed_segment(), replace(settings, horizon=3.0)
@@ -128,44 +128,40 @@ def test_vehicles_are_driven_and_people_walk_on(
     assert (np.abs(found.x[:, 1:, 0] - now - 1.2) < 1).all()
 
 
-def test_who_stands_stays_and_is_in_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    segment = mixed_segment()
-    velocity, position = segment.velocity.copy(), segment.position.copy()
-    position[2], velocity[2] = position[2, 10], 0.1
-    seen = []
+@pytest.fixture
+def seen(monkeypatch):
+    """What is simulated: scenes and configurations."""
+    found = []
 
-    def spied(agent: Any, scenes: Any, config: Any) -> Any:
-        seen.append(scenes)
+    def spied(agent, scenes, config):
+        found.append((scenes, config))
         return simulation(agent, scenes, config)
 
     monkeypatch.setattr("symphony.wosac.simulate.simulation", spied)
+    return found
+
+
+def test_who_stands_stays_and_is_in_the_way(seen):
+    segment = mixed_segment()
+    velocity, position = segment.velocity.copy(), segment.position.copy()
+    position[2], velocity[2] = position[2, 10], 0.1
     red = np.full_like(segment.signal_state, SignalState.STOP)
     still = segment.replace(position=position, velocity=velocity, signal_state=red)
     found = wosac_rollouts(small(), still, replace(PLAIN, horizon=2.0))
     assert np.ptp(found.x[:, 1], axis=-1).max() == 0
     assert np.ptp(found.x[:, 2:], axis=-1).min() > 5
-    (scenes,) = seen
+    ((scenes, _),) = seen
     assert int(scenes.interactive_valid.sum()) == 2
     # The others see it where it stands.
-    standing = int((scenes.log_state[0, 0, :, 0] - position[2, 10, 0]).abs().argmin())
-    np.testing.assert_allclose(scenes.log_state[0, :, standing, 0], position[2, 10, 0], atol=1e-4)
+    assert float((scenes.log_state[0, ..., 0] - position[2, 10, 0]).abs().amin(-1).max()) < 1e-4
 
 
-def test_goals_of_the_log_are_those_that_were_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_goals_of_the_log_are_those_that_were_taken(seen):
     segment = wosac_window(crossing(num_agents=3))
-    start, log = history_only(segment, 0.2), future_log(segment)
-    assert np.array_equal(start.position[:, 0], log.position[:, 0])
-    assert np.array_equal(start.agent_id, log.agent_id)
-    seen: list[Any] = []
-
-    def stop(agent: Any, scenes: Any, config: Any) -> Any:
-        seen.append((scenes, config))
-        raise DataError("enough")
-
-    monkeypatch.setattr("symphony.wosac.simulate.simulation", stop)
+    log = future_log(segment)
+    assert np.array_equal(history_only(segment, 0.2).position[:, 0], log.position[:, 0])
     for logged in (False, True):
-        with pytest.raises(DataError, match="enough"):
-            wosac_rollouts(load_agent(AGENT), segment, replace(PLAIN, logged_goals=logged))
+        wosac_rollouts(small(), segment, replace(PLAIN, logged_goals=logged))
     (sampled, before), (followed, config) = seen
     assert (before.logged_goals, config.logged_goals) == (False, True)
     assert np.array_equal(sampled.route_point, followed.route_point)
@@ -176,7 +172,7 @@ def test_goals_of_the_log_are_those_that_were_taken(monkeypatch: pytest.MonkeyPa
         assert away.max() < 3
 
 
-def test_lights_keep_the_latest_state_seen() -> None:
+def test_lights_keep_the_latest_state_seen():
     segment = mixed_segment()
     state = np.full((1, 91), SignalState.GO, np.uint8)
     state[0, 4], state[0, 5:11] = SignalState.STOP, SignalState.UNKNOWN
@@ -185,60 +181,23 @@ def test_lights_keep_the_latest_state_seen() -> None:
     assert (start.signal_state == SignalState.STOP).all()
 
 
-def test_playback_and_other_steps_are_refused() -> None:
-    with pytest.raises(ConfigError, match="playback"):
-        wosac_rollouts(load_agent("playback"), mixed_segment(), PLAIN)
-    with pytest.raises(DataError, match=r"steps of 0\.2 s"):
-        wosac_rollouts(load_agent(AGENT), straight_road(), PLAIN)
-    with pytest.raises(DataError, match="no agent"):
-        constant_velocity(mixed_segment().replace(valid=np.zeros((5, 91), bool)))
-
-
-# --- submissions ---
-
-
-def test_submission_is_valid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    data, out = (
-        write(tmp_path / "made.tfrecord", mixed_record(), womd_record("bbbb")),
-        tmp_path / "out.tar.gz",
-    )
-    common = ["--data", str(data), "--out", str(out), "--search", "none", *META]
-    assert main(["wosac", "submit", "constant_velocity", *common]) == 0
-    assert main(["wosac", "validate", str(out), "--scenario", str(data)]) == 0
-    assert "2 scenarios in 2 shards, all well" in capsys.readouterr().out
-
-
-def test_submission_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    data, out = write(tmp_path / "made.tfrecord", mixed_record()), tmp_path / "out.tar.gz"
-    for agent, more, text in (
-        ("playback", (), "playback"),
-        (AGENT, ("--shards", "2"), "don't fill 2 shards"),
-        (AGENT, ("--logged-goals",), "must not know the log"),
-        (AGENT, ("--horizon", "5"), "a submission has 8 s"),
+def test_submission(tmp_path, capsys):
+    data, out = tmp_path / "made.tfrecord", tmp_path / "out.tar.gz"
+    write_records(data, [one.SerializeToString() for one in (mixed_record(), womd_record("bbbb"))])
+    for more, text in (
+        ((AGENT, "--shards", "3"), "don't fill 3 shards"),
+        ((AGENT, "--logged-goals"), "must not know the log"),
+        ((AGENT, "--horizon", "5"), "a submission has 8 s"),
     ):
-        assert main(["wosac", "submit", agent, "--data", str(data), "--out", str(out), *META, *more]) != 0
+        assert submitted(data, out, *more) != 0
         assert text in capsys.readouterr().err
     assert not out.exists()
+    assert submitted(data, out, "constant_velocity", "--search", "none") == 0
+    report = check_submission(out, required_agents(data))
+    assert (report.problems, len(report.scenarios), len(report.shards)) == ([], 2, 2)
 
 
-@pytest.mark.samples
-def test_a_real_scenario_and_its_submission(samples: Path, tmp_path: Path) -> None:
-    file, out = samples / "womd" / "motion_data_one_scenario.tfrecord", tmp_path / "out.tar.gz"
-    ((_, number, payload),) = read_scenarios(file)
-    check_scenario_of(parse_scenario(payload, file, number))
-    command = ["wosac", "submit", AGENT, "--data", str(file), "--out", str(out), "--search", "none", *META]
-    assert main(command) == 0
-    assert not check_submission(out, required_agents(file)).problems
-
-
-# --- run segments as scenarios ---
-
-
-def test_scenario_of_a_segment_is_that_of_its_record() -> None:
-    check_scenario_of(mixed_record())
-
-
-def check_scenario_of(record: pb.Scenario) -> None:
+def check_scenario_of(record):
     segment = validate(scenario_to_segment(record))
     window, rollouts = wosac_window(segment), constant_velocity(segment)
     found, expected = (score(one, rollouts) for one in (wosac_scenario(window), logged_scenario(record)))
@@ -246,13 +205,23 @@ def check_scenario_of(record: pb.Scenario) -> None:
     assert np.array_equal(window.position, segment.position)
 
 
-def test_what_is_scored() -> None:
+def test_scenario_of_a_segment_is_that_of_its_record():
+    check_scenario_of(mixed_record())
+
+
+@pytest.mark.samples
+def test_a_real_scenario(samples):
+    file = samples / "womd" / "motion_data_one_scenario.tfrecord"
+    ((_, number, payload),) = read_scenarios(file)
+    check_scenario_of(parse_scenario(payload, file, number))
+
+
+def test_what_is_scored():
     segment = straight_road(num_agents=4)
 
-    def scored(one: RunSegment) -> list[int]:
-        return [int(name) for name in wosac_scenario(wosac_window(one)).evaluated]
+    def scored(one):
+        return wosac_scenario(wosac_window(one)).evaluated.tolist()
 
-    assert len(segment.predict) == 0
     assert scored(segment) == sorted(segment.agent_id)
     # An agent that comes later is not.
     assert scored(hide(segment, 3, slice(0, 6))) == sorted(segment.agent_id[:3])
@@ -260,19 +229,7 @@ def test_what_is_scored() -> None:
     assert scored(marked) == sorted(segment.agent_id[[segment.ego, 2]])
 
 
-def test_lights_of_a_segment() -> None:
-    segment = crossing()
-    window = wosac_window(segment)
-    scenario = wosac_scenario(window)
-    table = np.zeros((12, 91), np.uint8)
-    row = {int(lane): k for k, lane in enumerate(segment.road.lane_id[segment.signal_lane])}
-    table[[row[int(lane)] for lane in scenario.signal_lane], scenario.signal_step] = scenario.signal_state
-    assert np.array_equal(table, window.signal_state)
-    # 5 Hz to 10 Hz: each state holds until the next.
-    assert np.array_equal(table[:, ::2], segment.signal_state[:, :46])
-
-
-def test_a_world_with_a_far_origin_is_scored_as_one_about_its_own() -> None:
+def test_a_world_with_a_far_origin_is_scored_as_one_about_its_own():
     """Scores are in float32, which at 4 000 km, as in UTM coordinates, has steps of a quarter of a metre."""
     segment, found = crossing(num_agents=3), []
     for origin in ((0.0, 0.0, 0.0), (664_430.0, 3_998_210.0, 600.0)):
@@ -283,7 +240,7 @@ def test_a_world_with_a_far_origin_is_scored_as_one_about_its_own() -> None:
     assert wosac_window(near).origin.tolist() == near.origin.tolist()
 
 
-def test_lost_agents_are_nobodys_obstacle_in_the_log() -> None:
+def test_lost_agents_are_nobodys_obstacle_in_the_log():
     window = wosac_window(hide(straight_road(num_agents=4), 3, slice(20, None)))
     log = log_playback(window)
     assert np.array_equal(log.x[0, 3] > 9e4, ~window.valid[3, 11:])
@@ -292,12 +249,10 @@ def test_lost_agents_are_nobodys_obstacle_in_the_log() -> None:
     assert found["metametric"] > 0.7
 
 
-def test_short_logs_have_a_shorter_history() -> None:
+def test_short_logs_have_a_shorter_history():
     segment = straight_road(steps=43)  # 8.4 s
     window = validate(wosac_window(segment))
-    assert window.num_steps == 91
-    assert not window.valid[:, :6].any()
-    assert window.valid[:, 6:].all()
+    assert window.valid.tolist() == [[step >= 6 for step in range(91)]] * segment.num_agents
     np.testing.assert_allclose(window.position[:, 10], segment.position[:, 2], atol=1e-5)
     # What is not known goes back at the first velocity: no jump at the first step that is.
     np.testing.assert_allclose(np.diff(window.position[..., :2], 2, axis=1), 0, atol=1e-4)
@@ -306,20 +261,208 @@ def test_short_logs_have_a_shorter_history() -> None:
         wosac_window(straight_road(steps=40))
 
 
-def test_a_shorter_horizon_is_the_beginning_of_the_whole() -> None:
-    segment = resample(crossing(num_agents=4), 0.1)
-    agent, short = small(), replace(PLAIN, horizon=3.5)
+def test_a_shorter_horizon_is_the_beginning_of_the_whole():
+    segment, short = resample(crossing(num_agents=4), 0.1), replace(PLAIN, horizon=3.5)
     window, whole = wosac_window(segment, short.future), wosac_window(segment)
     assert window.num_steps == 46
-    long = wosac_rollouts(agent, whole, PLAIN)
+    long = wosac_rollouts(small(), whole, PLAIN)
     cut = SimulatedRollouts(long.object_id, *(getattr(long, name)[..., :35] for name in STATES))
-    assert same(wosac_rollouts(agent, window, short), cut)
-    first, second = (
-        compute_features(wosac_scenario(one), rollouts) for one, rollouts in ((whole, long), (window, cut))
-    )
+    assert same(wosac_rollouts(small(), window, short), cut)
+    first, second = (compute_features(wosac_scenario(one), by) for one, by in ((whole, long), (window, cut)))
     for name in first.log.keys() - {"average_displacement_error"}:
         for a, b in ((first.log, second.log), (first.simulated, second.simulated)):
             # The last two steps lack the neighbours that accelerations are made of.
             assert torch.equal(a[name][..., :33], b[name][..., :33]), name
     with pytest.raises(DataError, match=r"field x: has shape \(32, 4, 80\), expected \(32, 4, 35\)"):
         score(wosac_scenario(window), long)
+
+
+# --- vehicles that stand and people who walk ---
+
+
+def halted(window):
+    """Everyone stands where they are at the current step."""
+    now, still = np.full(window.num_steps, window.current_step), np.zeros_like(window.velocity)
+    return window.replace(position=window.position[:, now], heading=window.heading[:, now], velocity=still)
+
+
+@pytest.mark.parametrize(("away", "aside", "state", "stays"), [
+    (20.0, 0.0, SignalState.STOP, True), (20.0, 0.0, SignalState.UNKNOWN, True),
+    (20.0, 0.0, SignalState.GO, False), (20.0, 0.0, SignalState.ARROW_GO, False),
+    (20.0, 5.0, SignalState.GO, True),  # Another lane's.
+    (-5.0, 0.0, SignalState.GO, True), (AHEAD + 1, 0.0, SignalState.GO, True),
+])  # fmt: skip
+def test_who_stands_goes_on_green(away, aside, state, stays):
+    """The first agent sees a light so many metres ahead and to its left."""
+    window = wosac_window(crossing(num_agents=3))
+    now, angle, point = window.current_step, window.heading[0, 10], np.full_like(window.signal_point, 1e4)
+    cos, sin = np.cos(angle), np.sin(angle)
+    point[0, :2] = window.position[0, now, :2] + [away * cos - aside * sin, away * sin + aside * cos]
+    window = window.replace(signal_point=point, signal_state=np.full_like(window.signal_state, state))
+    assert not standing(window).any()
+    later = halted(window)
+    later.position[:, 11:] += 9  # What comes later is not known.
+    assert standing(halted(window))[0] == standing(later)[0] == stays
+
+
+def test_only_vehicles_that_have_stood_for_a_second_stand():
+    window = halted(wosac_window(straight_road(num_agents=4)))
+    kinds, position, valid = window.agent_type.copy(), window.position.copy(), window.valid.copy()
+    kinds[1] = AgentType.PEDESTRIAN
+    position[2, :3, 0] -= 1.0  # It has just come to a stand.
+    valid[3, :10] = False  # Nobody knows what it did before.
+    found = standing(window.replace(agent_type=kinds, position=position, valid=valid))
+    assert found.tolist() == [True, False, False, True]
+
+
+def test_people_keep_their_velocity_but_for_pace_and_course_and_turn_as_they_did():
+    window = wosac_window(straight_road(num_agents=3))
+    rows, now, heading = np.array([0, 2]), window.current_step, window.heading.copy()
+    found = walks(window, rows, 32, 80, 0)
+    assert found.shape == (32, 2, 80, 3)
+    start = np.broadcast_to(window.position[rows, now, None, :2], (32, 2, 1, 2))
+    steps = np.diff(np.concatenate([start, found[..., :2]], 2), axis=2)
+    np.testing.assert_allclose(steps, steps[:, :, :1].repeat(80, 2), atol=1e-5)  # Straight, at one speed.
+    velocity, logged = steps[:, :, 0] / window.dt, window.velocity[rows, now]
+    pace = np.linalg.norm(velocity, axis=-1) / np.linalg.norm(logged, axis=-1)
+    assert 1 - PACE <= pace.min() < 1 < pace.max() <= 1 + PACE
+    course = np.arctan2(velocity[..., 1], velocity[..., 0]) - np.arctan2(logged[:, 1], logged[:, 0])
+    assert -COURSE - 1e-6 <= course.min() < 0 < course.max() <= COURSE + 1e-6
+    assert len(np.unique(found[:, :, -1, 0])) == 64
+    # One agent's way depends on nobody else's; another seed gives another.
+    np.testing.assert_array_equal(walks(window, rows[1:], 32, 80, 0), found[:, 1:])
+    assert not np.array_equal(walks(window, rows, 32, 80, 1), found)
+    heading[0, now - 10 : now + 1] += 0.1 * (np.arange(11) % 2)
+    turned = walks(window.replace(heading=heading), rows[:1], 4, 80, 0)[..., 2]
+    np.testing.assert_allclose(np.abs(np.diff(turned, axis=-1)), 0.1, atol=1e-5)
+    assert len(np.unique(turned[:, 0, -1])) == 4
+
+
+def test_settings_are_those_of_the_evaluation():
+    config = EvaluateConfig(search="tree", branches=3, rule="replace", threshold=1.0, goals="branch", seed=4)
+    made = WosacSettings.of(config).config(32, 9)
+    assert (made.rollouts, made.trees, made.seed) == (32, 32, 9)
+    assert (made.branches, made.rule, made.threshold, made.goals) == (3, "replace", 1.0, "branch")
+    # What is left open is the agent's own, and the record says what that is.
+    how = simulated_how(load_agent(AGENT), WosacSettings.of(EvaluateConfig(search="tree")))
+    assert {"rule": "replace", "goals": "branch"}.items() <= how.items()
+    with pytest.raises(ConfigError, match="score is one of"):  # Who simulates must not know what is scored.
+        WosacSettings.of(EvaluateConfig(score="flags"))
+
+
+@pytest.mark.parametrize("case", ["turns in before", "crosses"])
+def test_who_goes_first_in_the_log_and_when_held_up(case):
+    window = wosac_window(scene(CASES[case][1]))
+    pairs, log, kinds = passing_pairs(window), log_playback(window), window.agent_type.copy()
+    assert [0, 1] in pairs.tolist()
+    kinds[1] = AgentType.PEDESTRIAN
+    assert [0, 1] not in passing_pairs(window.replace(agent_type=kinds)).tolist()
+    pairs = pairs[:1]
+    found = passing_gaps(window, pairs, log)
+    whole = order_of([found])
+    assert (whole.pairs, whole.kept) == (1, 1)
+    assert whole.gap_error < 0.3
+    # Whoever went first comes 5 s later, or never.
+    late = int(pairs[0][0 if float(found.log[0]) > 0 else 1])
+    states = {name: getattr(log, name).copy() for name in STATES}
+    for values in states.values():
+        values[:, late, 50:], values[:, late, :50] = values[:, late, :30].copy(), values[:, late, :1].copy()
+    held = order_of([passing_gaps(window, pairs, replace(log, **states))])
+    assert held.kept == 0
+    assert held.reversed + held.apart == pytest.approx(1)
+    window = wosac_window(straight_road())
+    assert order_of([passing_gaps(window, passing_pairs(window), constant_velocity(window))]).pairs == 0
+
+
+def test_evaluation(tmp_path):
+    logs = [straight_road(2, seed=k, group=f"recording {k // 2}") for k in range(3)]
+    store, out = tmp_path / "store", tmp_path / "scores.json"
+    fill(store, logs)
+
+    def record(*more):
+        assert main(["wosac", "evaluate", AGENT, "--data", str(store), "--json", str(out), *more]) == 0
+        return json.loads(out.read_text())
+
+    found = record("--search", "none", "--horizon", "2")
+    assert (found["objects"], found["hertz"]) == (6, [5.0])
+    assert list(found["agents"]) == ["playback", "constant_velocity", "idm", "random", AGENT]
+    assert found["how"] == {"search": "none", "seed": 0, "logged_goals": False, "horizon": 2.0}
+    for numbers in found["agents"].values():
+        each = [one["metametric"] for one in numbers["segments"].values()]
+        assert numbers["metametric"] == pytest.approx(np.mean(each))
+        assert numbers["metametric_se"] >= 0
+    window = wosac_window(logs[1], 20)
+    steady = found["agents"]["constant_velocity"]["segments"][logs[1].segment_id]
+    assert steady == pytest.approx(score(wosac_scenario(window), constant_velocity(window, future=20)))
+    # One recording has no error; a part of the store can be named; baselines search for nothing.
+    tree = ("--search", "tree", "--branches", "2", "--horizon", "1", "--segments", "2", "--config", "2024")
+    found = record(*tree)
+    assert (found["config"], found["how"]["search"]) == ("2024", "tree")
+    assert list(found["agents"][AGENT]["segments"]) == [logs[2].segment_id]
+    assert found["agents"][AGENT]["metametric_se"] is None
+
+
+def test_a_segment_that_cannot_be_scored_ends_no_others_whatever_the_workers(tmp_path):
+    whole = [crossing(num_agents=2, seed=k) for k in range(2)]
+    road, walking = whole[0].road, np.full_like(whole[0].agent_type, AgentType.PEDESTRIAN)
+    bare = whole[0].replace(segment_id="bare", road=replace(road, boundary=road.boundary.of([])))
+    walkers, short = whole[0].replace(segment_id="walkers", agent_type=walking), straight_road(2, steps=12)
+    fill(tmp_path / "store", [bare, whole[0], walkers, short, whole[1]])
+    agent, store, done = load_agent(RANDOM), SegmentStore(tmp_path / "store"), []
+
+    def evaluated(items, seed=0, workers=1, **changes):
+        settings = replace(PLAIN, workers=workers, seed=seed)
+        changes |= {"baselines": False, "progress": lambda *at: done.append(at)}
+        return evaluate_wosac(agent, store, items, settings, **changes)
+
+    found = evaluated(range(5))
+    assert found.segments == [whole[0].segment_id, whole[1].segment_id]
+    assert [entry["segment"] for entry in found.record()["left_out"]] == ["bare", "walkers", short.segment_id]
+    assert done == [(k, 5) for k in range(1, 6)]
+    others = [evaluated([1, 4], workers=2), evaluated([1, 4], seed=1)]
+    assert [found.numbers(RANDOM) == other.numbers(RANDOM) for other in others] == [True, False]
+    for items, strict, text in ((range(5), True, "no road edge"), ([2, 0], False, "time_to_collision")):
+        with pytest.raises(SymphonyError, match=text):
+            evaluated(items, strict=strict)
+
+
+def test_the_record_has_the_score_and_tables_have_its_columns(tmp_path, capsys):
+    fill(tmp_path / "store", [straight_road(2, seed=k, group=f"recording {k}") for k in range(2)])
+    one, two, data = tmp_path / "one.json", tmp_path / "two.json", str(tmp_path / "store")
+    how = ("--json", str(one), "--rollouts", "2", "--metrics", "wosac")
+    assert main(["evaluate", RANDOM, "--data", data, *how]) == 0
+    record = json.loads(one.read_text())
+    scores, whole = record["wosac"], record["wosac"]["agents"]
+    for at, name in ((record, RANDOM), (record["playback"], "playback")):
+        assert at["wosac_min_ade"] == whole[name]["min_ade"]
+        assert at["wosac_metametric_se"] == whole[name]["metametric_se"]
+    assert 0 < record["wosac_metametric"] < record["playback"]["wosac_metametric"] < 1
+    # The table of runs has its columns where every run has them, of one year.
+    kept = record | {"run": {"updates": 0, "named": False, "checkpoint": 0}}
+    entries = [Entry(Path(m), {"method": m, "seed": 0}, m, kept) for m in ("bc", "bc_h")]
+    assert set(WOSAC) <= set(compare(entries, "main")["columns"])
+    other = {key: value for key, value in kept.items() if not key.startswith("wosac")}
+    without = compare([entries[0], replace(entries[1], record=other)], "main")["columns"]
+    assert not set(WOSAC) & set(without)
+    year = kept | {"wosac": scores | {"config": "2024"}}
+    with pytest.raises(ConfigError, match="WOSAC scores of 2024, 2025"):
+        compare([entries[0], replace(entries[1], record=year)], "main")
+    # The table of scores.
+    one.write_text(json.dumps(scores))
+    alone = scores | {"agents": {RANDOM: whole[RANDOM]}}
+    two.write_text(json.dumps(alone))
+    capsys.readouterr()
+    assert main(["wosac", "table", str(two), str(one), "--names", "two", "one"]) == 0
+    rows = [line.split("|")[1:] for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    drivers = ["log playback", "constant velocity", "intelligent driver model", "random"]
+    assert [row[0].strip() for row in rows] == ["", "---", *drivers, "two", "one"]
+    for column, cell in zip(COLUMNS, rows[-1][1:], strict=False):
+        value, error = column.scale * whole[RANDOM][column.key], 0.51 * 10**-column.digits
+        assert float(cell.split(" ± ")[0]) == pytest.approx(value, abs=error)
+    for changes in ({"how": scores["how"] | {"horizon": 5.0}}, {"config": "2024"}):
+        with pytest.raises(ConfigError, match="different run segments, years or horizons"):
+            wosac_table([alone, alone | changes])
+    for text in ("{}", "[]", "nothing", json.dumps({"agent": "a", "agents": {"b": {}}})):
+        two.write_text(text)
+        with pytest.raises(DataError, match=r"two\.json: not a record of symphony wosac evaluate"):
+            read_wosac(two)
