@@ -326,8 +326,8 @@ def test_collectors_and_objectives_stand_alone():
         for source in (ROOM / package).glob("*.py"):
             nodes = list(ast.walk(ast.parse(source.read_text())))
             names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
-            froms = [node for node in nodes if isinstance(node, ast.ImportFrom)]
-            for name in [*names, *(f"{node.module or ''}.{a.name}" for node in froms for a in node.names)]:
+            imported = [node for node in nodes if isinstance(node, ast.ImportFrom)]
+            for name in [*names, *(f"{node.module or ''}.{a.name}" for node in imported for a in node.names)]:
                 first, *rest = name.split(".")
                 assert name.startswith(f"symphony.{package}") or first in allowed, (source.name, name)
                 private = first == "torchrl" and any(part.startswith("_") for part in rest)

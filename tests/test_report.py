@@ -268,6 +268,10 @@ def test_the_command_writes_page_numbers_and_table(tmp_path: Path, capsys: Any) 
     assert "http" not in page
     assert (tmp_path / "sim" / "view.html").is_file()
     assert main(["report", str(tmp_path / "sim"), "--no-view", "--out", str(tmp_path / "other")]) == 0
-    assert sorted(p.name for p in (tmp_path / "other").iterdir()) == ["report.csv", "report.html", "report.json"]
+    assert sorted(p.name for p in (tmp_path / "other").iterdir()) == [
+        "report.csv",
+        "report.html",
+        "report.json",
+    ]
     assert main(["report", str(tmp_path / "nothing")]) == 1
     assert "no folder of rollouts" in capsys.readouterr().err

@@ -14,10 +14,6 @@ class AllFailedError(SymphonyError):
     """Every run failed: there are results, but they only say why."""
 
 
-class ThresholdError(SymphonyError):
-    """A planner does not keep the thresholds of a suite."""
-
-
 class CouldNotRunError(SymphonyError):
     """A suite could not run at all."""
 
@@ -48,14 +44,10 @@ class DataError(SymphonyError):
     def at(self, *, file: object = None, segment: str | None = None) -> Self:
         """Return the same error with the places that were still unknown filled in."""
         error = copy.copy(self)
-        error.file = file if self.file is None else self.file
-        error.segment = segment if self.segment is None else self.segment
+        error.file, error.segment = self.file or file, self.segment or segment
         return error
 
 
 def printable(text: str, keep: str = "") -> str:
     """Escape everything in a text but ``keep`` that can't be shown, or on which a terminal would act."""
-    return "".join(
-        c if c.isprintable() or c in keep else c.encode("unicode_escape", "surrogatepass").decode()
-        for c in text
-    )
+    return "".join(c if c.isprintable() or c in keep else ascii(c)[1:-1] for c in text)

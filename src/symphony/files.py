@@ -10,7 +10,7 @@ import re
 import socket
 import weakref
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,8 @@ def naming(path: Path) -> Iterator[None]:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a draft of the same suffix, which replaces ``path`` at the end of the block; make its folder.
 
-    If the block fails, what was at ``path`` stays as it was and nothing is left behind. Links are followed, and what
-    is no ordinary file (a terminal, a pipe) is written to as it is. Raises a :class:`DataError` if the disk refuses.
+    If the block fails, what was at ``path`` stays as it was. Links are followed, and what is no ordinary file (a
+    terminal, a pipe) is written to as it is. Raises a :class:`DataError` if the disk refuses.
     """
     with naming(path):
         place = _place(path)
@@ -58,14 +58,12 @@ def _place(path: Path) -> Path:
 def _remove_drafts(place: Path) -> None:
     """Remove drafts of this file by processes that were killed."""
     pattern = re.compile(rf"\.{re.escape(place.stem)}\.(\d+)\.new{re.escape(place.suffix)}")
-    for other in place.parent.iterdir():
+    for found in filter(None, map(pattern.fullmatch, os.listdir(place.parent))):
         try:
-            if found := pattern.fullmatch(other.name):
+            with suppress(PermissionError):  # somebody else's process lives
                 os.kill(int(found[1]), 0)
         except (ProcessLookupError, OverflowError):
-            other.unlink(missing_ok=True)
-        except PermissionError:
-            pass  # somebody else's process lives
+            (place.parent / found[0]).unlink(missing_ok=True)
 
 
 def write_file(path: Path, text: str) -> None:
@@ -93,15 +91,10 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-class Lock:
-    """Keeps other writers out of a folder, or a file, until it is closed or this process ends.
+class Lock(AbstractContextManager["Lock"]):
+    """Keeps other writers out of a folder or a file until it is closed or this process ends; they are told who writes.
 
-    Args:
-        path: the file that stands for it, removed in the end. It says who writes, which whoever else comes is told.
-        output: what is written; by default the folder of that file.
-
-    Raises:
-        DataError: another process is at it, or the disk refuses; names the output.
+    The file at ``path``, removed in the end, stands for the ``output``, by default its folder, which errors name.
     """
 
     def __init__(self, path: Path, output: Path | None = None) -> None:
@@ -132,18 +125,14 @@ class Lock:
         if not _is_at(self._file, self.path):
             raise DataError("was removed or replaced while this process wrote into it", file=self.output)
 
-    def __enter__(self) -> Lock:
-        return self
-
     def __exit__(self, *error: object) -> None:
         self.close()
 
 
 def _is_at(file: int, path: Path) -> bool:
-    try:
+    with suppress(FileNotFoundError):
         return os.path.samestat(os.fstat(file), path.stat())
-    except FileNotFoundError:
-        return False
+    return False
 
 
 def _release(path: Path, file: int, process: int) -> None:
@@ -154,7 +143,7 @@ def _release(path: Path, file: int, process: int) -> None:
 
 
 def lock_file(path: Path) -> AbstractContextManager[object]:
-    """Keep other writers away from a file, as :class:`Lock` does, if it can be written; a terminal needs no lock."""
+    """Keep other writers away from a file, as :class:`Lock` does; a terminal needs no lock."""
     with naming(path):
         place = _place(path)
     if place.is_dir():

@@ -1,7 +1,4 @@
-"""Registers ``symphony/Driving-v0`` with Gymnasium (the extra ``gym``); nothing heavy is imported until one is made.
-
-``gymnasium.make("symphony.gym:symphony/Driving-v0", data="store")`` makes one without another import.
-"""
+"""Registers what ``gymnasium.make("symphony.gym:symphony/Driving-v0", data="store")`` makes (the extra ``gym``)."""
 
 try:
     import gymnasium

@@ -4,57 +4,55 @@ from __future__ import annotations
 
 import ast
 import importlib
-import importlib.util
 import os
 import sys
 from collections.abc import Callable
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from symphony.errors import ConfigError
 
 
 def load_object(path: str, *, here: bool = True) -> Any:
-    """Import ``module:name``. A file will do, too: ``path/to/file.py:name``, with what lies beside it to import.
+    """Import ``module:name``, or ``path/to/file.py:name``, with what lies beside the file to import.
 
-    Args:
-        path: the import path.
-        here: find modules in the current folder, too, as ``python -m`` does. Not for paths that the user did not
-            type: whatever lies in the folder would run.
+    Unless ``here`` is False, modules are looked for in the current folder, too, as ``python -m`` does. Not for paths
+    that the user did not type: whatever lies in the folder would run.
 
     Raises:
-        ConfigError: if there is no such module, file or name.
+        ConfigError: if there is no such module, file or name, or it can't be imported.
     """
     module, _, name = path.rpartition(":")
-    file, paths = module.endswith(".py"), {os.getcwd(), ""}
+    load = _file if module.endswith(".py") else importlib.import_module
     try:
         try:
-            found: Any = _file(Path(module).resolve()) if file else importlib.import_module(module)
+            found: Any = load(module)
         except ModuleNotFoundError:
-            if file or not here or not paths.isdisjoint(sys.path):
+            if load is _file or not here or not {os.getcwd(), ""}.isdisjoint(sys.path):
                 raise
             sys.path.append(os.getcwd())
-            found = importlib.import_module(module)
+            found = load(module)
         for part in name.split("."):
             found = getattr(found, part)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"can't import '{path}': {error}") from error
     except (Exception, SystemExit) as error:  # whatever a user's module raises
-        raise ConfigError(f"can't import '{path}': {type(error).__name__}: {error}") from error
+        usual = isinstance(error, ImportError | AttributeError | ValueError)
+        raise ConfigError(
+            f"can't import '{path}': {'' if usual else f'{type(error).__name__}: '}{error}"
+        ) from error
     return found
 
 
-def _file(path: Path) -> ModuleType:
+def _file(name: str) -> Any:
     """A file as a module, run once."""
+    path = Path(name).resolve()
     if str(path) in sys.modules:
         return sys.modules[str(path)]
-    spec = importlib.util.spec_from_file_location(str(path), path)
+    spec = spec_from_file_location(str(path), path)
     if not path.is_file() or spec is None or spec.loader is None:
         raise ImportError(f"{path}: no such file")
-    if str(path.parent) not in sys.path:
-        sys.path.append(str(path.parent))
-    module = sys.modules[str(path)] = importlib.util.module_from_spec(spec)
+    sys.path += [str(path.parent)] if str(path.parent) not in sys.path else []
+    module = sys.modules[str(path)] = module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
     except BaseException:
@@ -66,12 +64,11 @@ def _file(path: Path) -> ModuleType:
 def lazily(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return ``__getattr__`` and ``__dir__`` of a package whose names are imported when they are asked for.
 
-    Where they are from is what its ``if TYPE_CHECKING`` block says, so that nothing is written twice. A name that is
-    also that of a module of the package does not work: Python would give the module to whoever imported that before.
+    Its ``if TYPE_CHECKING`` block says where they are from. A name must not be that of a module of the package, too.
     """
     source = Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8")
-    blocks = [block for block in ast.parse(source).body if isinstance(block, ast.If)]
-    imports = [node for block in blocks for node in block.body if isinstance(node, ast.ImportFrom)]
+    nodes = [node for block in ast.parse(source).body if isinstance(block, ast.If) for node in block.body]
+    imports = [node for node in nodes if isinstance(node, ast.ImportFrom)]
     homes = {alias.name: str(node.module) for node in imports for alias in node.names}
 
     def get(name: str) -> Any:

@@ -8,7 +8,6 @@ from __future__ import annotations
 Key = str | tuple[str, ...]
 
 SCENE: Key = "scene"  # [..., 1] int64: row of the environment's scene batch
-SEGMENT: Key = "segment"  # [..., 1] int64: number of the run segment among those that scenes are drawn from
 STEP: Key = "step"  # [..., 1] int64: simulated steps since the first state
 STREAM: Key = "stream"  # [..., 1] int64: identity of the rollout, from which all its random numbers derive
 PLANNER: Key = "planner"  # [..., 1] int64: number of the planner that drives the ego of the rollout

@@ -51,19 +51,13 @@ def ordered_map(
     engine: Engine = "local",
     imports: Sequence[str] = (),
 ) -> Results[R]:
-    """Apply a function to every task; results come in the order of the tasks, whoever is done first.
+    """Apply a function of a module to every task; results come in the order of the tasks, whoever is done first.
 
-    Tasks are taken from the iterable as results are asked for, at most ``2 * workers`` ahead. One local worker is
-    this very process. When an error, an interrupt or ``close`` cuts it short, the tasks under way are abandoned. What
-    ``function`` raises comes through; a worker that dies is a :class:`SymphonyError`.
-
-    Args:
-        function: a function of a module (it is pickled, and so are tasks and results).
-        tasks: its arguments.
-        workers: processes; with Ray, tasks at a time are between this and ``2 * workers``, as CPUs are free.
-        engine: ``local`` for processes of this machine, ``ray`` for Ray: the cluster at ``RAY_ADDRESS`` or the
-            one ``ray.init`` was called for, else one on this machine.
-        imports: modules that the tasks need beside the function's own, see :func:`get_ready`.
+    Tasks are taken as results are asked for, at most ``2 * workers`` ahead. One local worker is this very process.
+    An error, an interrupt or ``close`` abandons the tasks under way. What ``function`` raises comes through; a worker
+    that dies is a :class:`WorkerError`. ``engine`` is ``local`` for processes of this machine or ``ray`` for the
+    cluster at ``RAY_ADDRESS`` or that ``ray.init`` was called for, else one on this machine. ``imports`` are modules
+    that local workers need beside the function's own.
     """
     if workers < 1:
         raise ConfigError(f"workers must be at least 1, is {workers}")
@@ -77,15 +71,10 @@ def ordered_map(
 
 
 def get_ready(imports: Sequence[str]) -> None:
-    """Begin to import what local workers need, in a process of its own from which all of them are forked (Linux).
-
-    A program that calls this before its own imports has both done at the same time. Workers that come after find
-    imported what the first call asked for and what of this package its process had imported until then.
-    """
+    """Start the process that workers are forked from (Linux), with what they need and ours that is imported here."""
     if _START == "forkserver":
-        ours = [name for name in sys.modules if name.startswith("symphony.")]
-        context = multiprocessing.get_context(_START)
-        context.set_forkserver_preload([name for name in (*ours, *imports) if name != "__main__"])
+        names = [name for name in sys.modules if name.startswith("symphony.")] + list(imports)
+        forkserver.set_forkserver_preload([name for name in names if name != "__main__"])
         with _starting():
             forkserver.ensure_running()
 
@@ -93,16 +82,15 @@ def get_ready(imports: Sequence[str]) -> None:
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
     """Processes started inside have the environment of workers and put off interrupts: the parent's are enough."""
-    before = {name: os.environ.get(name) for name in WORKER_ENVIRONMENT}
+    before = {name: os.environ[name] for name in WORKER_ENVIRONMENT if name in os.environ}
     try:
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         os.environ.update(WORKER_ENVIRONMENT)
         yield
     finally:
-        for name, value in before.items():
+        for name in WORKER_ENVIRONMENT:
             os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
+        os.environ.update(before)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
@@ -116,21 +104,19 @@ def _ahead(submit: Callable[[T], Any], tasks: Iterator[T], count: int) -> Iterat
 
 
 def _local_map(
-    function: Callable[[T], R], tasks: Iterator[T], workers: int, imports: Sequence[str]
+    function: Callable[[T], R], tasks: Iterator[T], workers: int, imports: list[str]
 ) -> Results[R]:
     get_ready(imports)
     context = multiprocessing.get_context(_START)
     lifeline, ours = context.Pipe(duplex=False)
-    # A server keeps the environment that it was started with.
-    environment = {**os.environ, **WORKER_ENVIRONMENT}
+    environment = {**os.environ, **WORKER_ENVIRONMENT}  # a server keeps that which it was started with
     pool = ProcessPoolExecutor(workers, context, _begin_worker, (lifeline, environment))
 
     def submit(task: T) -> Any:
         with _starting():  # processes are started here, as they are needed
             return pool.submit(function, task)
 
-    pending: deque[Any] = deque()
-    done = 0
+    pending, done = deque[Any](), 0
     try:
         for pending in _ahead(submit, tasks, IN_FLIGHT * workers):
             yield pending[0].result()
@@ -158,17 +144,17 @@ def _begin_worker(lifeline: Connection, environment: dict[str, str]) -> None:
 
 def _ray(workers: int) -> Any:
     """Ray, connected."""
+    address = os.environ.get("RAY_ADDRESS")
+    size: dict[str, Any] = {} if address else {"num_cpus": workers, "include_dashboard": False}
     try:
         import ray  # noqa: PLC0415 (optional)
+
+        if not ray.is_initialized():
+            ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING, **size)
     except ImportError as error:
         raise ConfigError("the engine 'ray' needs Ray: pip install 'symphony-traffic[ray]'") from error
-    if not ray.is_initialized():
-        address = os.environ.get("RAY_ADDRESS")
-        size: dict[str, Any] = {} if address else {"num_cpus": workers, "include_dashboard": False}
-        try:
-            ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING, **size)
-        except (ConnectionError, ValueError, RuntimeError) as error:
-            raise ConfigError(f"no Ray cluster at RAY_ADDRESS={address}: {error}") from error
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise ConfigError(f"no Ray cluster at RAY_ADDRESS={address}: {error}") from error
     return ray
 
 

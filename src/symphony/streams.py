@@ -1,7 +1,6 @@
 """Random numbers as a function of (seed, stream, step).
 
-A generator's state ties a rollout's numbers to how many others were drawn before, hence to its batch. Here a number
-is a hash of what it is for, so that a rollout is the same in any batch, branch layout, process or device.
+A number is a hash of what it is for, so that a rollout is the same in any batch, branch layout, process or device.
 """
 
 from __future__ import annotations
@@ -18,8 +17,7 @@ from torch import Tensor
 class Stream(IntEnum):
     """Uses of random numbers with a stream of their own, derived from that of a scene or a rollout.
 
-    The numbers lie far above those of rollouts, branches and agents, which are counted from 0 and fold into the same
-    streams. A number stays with its use, or a seed would give other rollouts: 2 belonged to a use that is gone.
+    Rollouts, branches and agents, which fold into the same streams, count from 0. A use keeps its number for good.
     """
 
     GOALS = 1 << 40  # routes of the agents of a scene
@@ -32,13 +30,11 @@ class Stream(IntEnum):
 
 # SplitMix64: Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014.
 _GAMMA = 0x9E3779B97F4A7C15
-_MULTIPLIERS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 
 
 def _signed(value: int) -> int:
     """The int64 with the low 64 bits of `value`."""
-    value &= (1 << 64) - 1
-    return value - (1 << 64) if value >> 63 else value
+    return (value + (1 << 63)) % (1 << 64) - (1 << 63)
 
 
 def _shift_xor(x: Int[Tensor, "*b"], bits: int) -> Int[Tensor, "*b"]:
@@ -48,8 +44,8 @@ def _shift_xor(x: Int[Tensor, "*b"], bits: int) -> Int[Tensor, "*b"]:
 
 def _mix(x: Int[Tensor, "*b"]) -> Int[Tensor, "*b"]:
     """SplitMix64's finaliser, a bijection of int64 in which each input bit sways each output bit."""
-    x = _shift_xor(x, 30) * _signed(_MULTIPLIERS[0])
-    x = _shift_xor(x, 27) * _signed(_MULTIPLIERS[1])
+    x = _shift_xor(x, 30) * _signed(0xBF58476D1CE4E5B9)
+    x = _shift_xor(x, 27) * _signed(0x94D049BB133111EB)
     return _shift_xor(x, 31)
 
 
@@ -76,7 +72,6 @@ def uniform(seed: int, stream: Int[Tensor, "*#b"], step: Int[Tensor, "*#b"] | in
     if stream.dtype != torch.int64:
         raise ValueError(f"streams are int64, got {stream.dtype}")
     start = torch.full((), _signed(seed), dtype=torch.int64, device=stream.device)
-    hashed = fold_in(fold_in(_mix(start), stream), step)
-    top = (hashed >> 41) & ((1 << 23) - 1)
+    top = (fold_in(fold_in(_mix(start), stream), step) >> 41) & ((1 << 23) - 1)
     # The middle of one of 2^23 equal cells: exact in this dtype, and never 0 or 1.
     return (2 * top + 1).to(torch.float32) * 2.0**-24

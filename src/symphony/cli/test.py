@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from symphony.cli import shared
-from symphony.errors import CouldNotRunError, SymphonyError, ThresholdError
+from symphony.errors import CouldNotRunError, SymphonyError
 from symphony.files import write_file
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Test(shared.Command):
             raise CouldNotRunError(str(error)) from error
         failing, page = sum(one.status != "passes" for one in result.verdicts), self.out / "index.html"
         if failing:
-            raise ThresholdError(f"{failing} of {len(result.verdicts)} thresholds are not kept: see {page}")
+            raise SymphonyError(f"{failing} of {len(result.verdicts)} thresholds are not kept: see {page}")
 
     def _written(self) -> Result:
         from symphony.bench.pages import junit, page, sentence
