@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from functools import lru_cache
 from typing import Any
 
@@ -74,4 +75,4 @@ def searched(
     how: dict[str, Any] = {"goal": found.goal, "search": found.search, "driver": AGENT}
     segments = [dataset.segment(b).replace(group=store.tags(b)["network"]) for b in range(count)]
     saved = [saved_rollouts(segment, scenes, found.rollouts, b, **how) for b, segment in enumerate(segments)]
-    return About.of(AGENT, store, config), saved
+    return About.of(AGENT, store, asdict(config)), saved

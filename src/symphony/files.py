@@ -92,7 +92,7 @@ def finite(value: Any) -> Any:
 
 
 class Lock(AbstractContextManager["Lock"]):
-    """Keeps other writers out of a folder or a file until it is closed or this process ends; they are told who writes.
+    """Keeps other writers, who are told of it, out of a folder or a file until it is closed or this process ends.
 
     The file at ``path``, removed in the end, stands for the ``output``, by default its folder, which errors name.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import socket
@@ -106,7 +107,7 @@ def _simulate(store: Path, out: Path) -> None:
 
 def _evaluate(store: Path, out: Path) -> None:
     agent, segments = load_agent(AGENT), SegmentStore(store)
-    writer = RolloutWriter(out / "rollouts", About.of(AGENT, segments, CONFIG))
+    writer = RolloutWriter(out / "rollouts", About.of(AGENT, segments, dataclasses.asdict(CONFIG)))
 
     def observe(item: int, saved: SavedRollouts) -> None:
         if not writer.has(saved.segment.segment_id):

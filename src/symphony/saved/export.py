@@ -14,17 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.segment import AgentType, LaneType, Polylines, RunSegment, SignalState
+from symphony.data.segment import AgentType, LaneType, RunSegment, SignalState
 from symphony.saved.rollouts import PLAYBACK, SavedRollouts, World, world_of
 
 Reals = NDArray[np.float64]
 
-NOMINAL_WIDTH, BIKE_WIDTH = 3.6, 1.6
-"""Metres, of lanes whose width is not known."""
-TRUCK = 7.0
-"""Metres of length from which a vehicle is a truck."""
-STRAIGHT = 0.5
-"""Radians that a lane may turn and still lead straight on."""
+NOMINAL_WIDTH, BIKE_WIDTH = 3.6, 1.6  # metres, of lanes whose width is not known
+TRUCK = 7.0  # metres of length from which a vehicle is a truck
+STRAIGHT = 0.5  # radians that a lane may turn and still lead straight on
 
 _TYPES = {AgentType.PEDESTRIAN: "pedestrian", AgentType.CYCLIST: "bicycle"}
 _LANES = {LaneType.FREEWAY: "highway", LaneType.SURFACE_STREET: "urban", LaneType.BIKE_LANE: "bicycleLane"}
@@ -35,14 +32,12 @@ def commonroad(saved: SavedRollouts, rollout: int) -> str:
     """A rollout as a CommonRoad scenario.
 
     Every agent is a dynamic obstacle with the id it has in the source (all shifted alike if some are not positive);
-    one that is lost for some steps becomes an obstacle more for each stretch. Lanelets lie half a lane's width to
-    either side of the centre lines, nominal where the width is not known; lanes of a single point are left out.
-    Lights that flash or are not known are inactive.
+    each further stretch of steps at which it is seen is another. Lanelets are nominally wide where the log does not
+    say; lanes of a single point are left out. Lights that flash or are not known are inactive.
     """
     segment = saved.segment
     letters = "".join(word.capitalize() for word in re.findall("[A-Za-z]+", segment.segment_id)) or "Segment"
-    # The format's names have room for letters and numbers only: this one tells segments apart.
-    number = 1 + zlib.crc32(segment.segment_id.encode()) % 999_999
+    number = 1 + zlib.crc32(segment.segment_id.encode()) % 999_999  # names hold nothing else
     name = f"ZAM_{letters[:60]}-{number}_{rollout + 1}_T-1"
     about = {"commonRoadVersion": "2020a", "benchmarkID": name, "timeStepSize": repr(float(segment.dt))}
     about |= {"author": "", "affiliation": ""}
@@ -53,8 +48,7 @@ def commonroad(saved: SavedRollouts, rollout: int) -> str:
         _add(location, tag, value)
     _add(_add(root, "scenarioTags"), "simulated")
     obstacles = _obstacles(saved, rollout)
-    # Of a run that failed at once nobody may be left.
-    taken = max((int(obstacle.get("id", 0)) for obstacle in obstacles), default=0)
+    taken = max((int(obstacle.get("id", 0)) for obstacle in obstacles), default=0)  # nobody may be left
     _Network(segment, slice(saved.start, saved.last + 1), 1 + taken).add(root)
     root.extend(obstacles)
     ET.indent(root)
@@ -138,8 +132,7 @@ class _Network:
             refs += [("trafficLightRef", number) for number, _, lanes, _ in lights if k in lanes]
             self._lanelet(root, k, refs)
         for limit, number in signs.items():
-            node = _add(root, "trafficSign", id=number)
-            element = _add(node, "trafficSignElement")
+            element = _add(node := _add(root, "trafficSign", id=number), "trafficSignElement")
             _add(element, "trafficSignID", "274")
             _add(element, "additionalValue", limit)
             _point(node, "position", self.lines[next(k for k in self.lines if limits[k] == limit)][0])
@@ -151,9 +144,8 @@ class _Network:
             node = _add(root, "intersection", id=next(self.number))
             incoming = _add(node, "incoming", id=next(self.number))
             _add(incoming, "incomingLanelet", ref=self.ids[lane])
-            after = sorted((self._turn(b), b) for a, b in self.flow if a == lane)
             for turn in ("right", "straight", "left"):
-                for _, other in (pair for pair in after if pair[0] == turn):
+                for other in sorted(b for a, b in self.flow if a == lane and self._turn(b) == turn):
                     _add(incoming, f"successors{turn.capitalize()}", ref=self.ids[other])
 
     def _lanelet(self, root: ET.Element, k: int, refs: list[tuple[str, int]]) -> None:
@@ -166,13 +158,13 @@ class _Network:
             side = _add(node, tag)
             for place in bound:
                 _point(side, "point", place)
-        for before in (a for a, b in self.flow if b == k):
-            _add(node, "predecessor", ref=self.ids[before])
-        for after in (b for a, b in self.flow if a == k):
-            _add(node, "successor", ref=self.ids[after])
+        beside = [("predecessor", a) for a, b in self.flow if b == k]
+        for tag, other in beside + [("successor", b) for a, b in self.flow if a == k]:
+            _add(node, tag, ref=self.ids[other])
         for tag, name in (("adjacentLeft", "left_neighbors"), ("adjacentRight", "right_neighbors")):
-            # The format knows one on either side.
-            for other in [b for a, b in self._pairs(name) if a == k][:1]:
+            for other in [b for a, b in self._pairs(name) if a == k][
+                :1
+            ]:  # the format knows one on either side
                 _add(node, tag, ref=self.ids[other], drivingDir="same")
         _add(node, "laneletType", _LANES.get(kind, "unknown"))
         for tag, number in refs:
@@ -184,8 +176,7 @@ class _Network:
         return "straight" if abs(turn) < STRAIGHT else "left" if turn > 0 else "right"
 
     def _light(self, root: ET.Element, number: int, light: int, turn: str) -> None:
-        node = _add(root, "trafficLight", id=number)
-        cycle = _add(node, "cycle")
+        cycle = _add(node := _add(root, "trafficLight", id=number), "cycle")
         states = self.segment.signal_state[light, self.within].tolist()
         names = [SignalState(state).name.removeprefix("ARROW_") for state in states]
         for color, run in groupby(_COLORS.get(name, "inactive") for name in names):
@@ -211,52 +202,34 @@ def _normals(line: Reals) -> Reals:
 
 
 def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
-    """A rollout as JSON can hold it: agents with their states (step, x, y in metres, heading in radians, speed in
-    m/s), routes, and the steps of collisions and time off the road; lights; the map.
-    """
+    """A rollout for JSON: agents with states (step, x, y, heading, speed), routes and events, lights, and the map."""
     segment, world, origin = saved.segment, world_of(saved, rollout), saved.segment.origin[:2]
     place = world.position + origin
     agents = []
     for row in np.flatnonzero(world.valid.any(1)).tolist():
         values = np.column_stack([place[row], world.heading[row], world.speed[row]])
         steps = np.flatnonzero(world.valid[row]).tolist()
-        found = {
-            "id": int(segment.agent_id[row]),
-            "type": AgentType(segment.agent_type[row]).name.lower(),
-            "length": float(segment.size[row, 0]),
-            "width": float(segment.size[row, 1]),
-            "ego": row == segment.ego,
-            "driver": PLAYBACK,
-            "states": [[step, *(round(value, 6) for value in values[step].tolist())] for step in steps],
-        }
+        kind = AgentType(segment.agent_type[row]).name.lower()
+        agent: dict[str, Any] = {"id": int(segment.agent_id[row]), "type": kind}
+        agent |= dict(zip(("length", "width"), segment.size[row, :2].tolist(), strict=True))
+        agent |= {"ego": row == segment.ego, "driver": PLAYBACK}
+        agent["states"] = [[step, *(round(value, 6) for value in values[step].tolist())] for step in steps]
         for n in np.flatnonzero(saved.agents == row).tolist():
-            found["driver"], route = saved.drivers[n], int(saved.goal[rollout, n])
-            found["route"] = None if route < 0 else (saved.routes[route][:, :2] + origin).tolist()
+            agent["driver"], route = saved.drivers[n], int(saved.goal[rollout, n])
+            agent["route"] = None if route < 0 else (saved.routes[route][:, :2] + origin).tolist()
             for name in ("collision", "offroad"):
                 flags = getattr(saved, name)[rollout, :, n] & saved.counted[rollout, :, n]
-                found[name] = (1 + np.flatnonzero(flags)).tolist()
-        agents.append(found)
+                agent[name] = (1 + np.flatnonzero(flags)).tolist()
+        agents.append(agent)
 
-    def lines(found: Polylines) -> list[Any]:
-        return [(found[k][:, :2] + origin).tolist() for k in range(len(found))]
-
-    lights = [
-        {
-            "lane": int(lane),
-            "stop": (point[:2] + origin).tolist(),
-            "states": [SignalState(state).name.lower() for state in states[saved.start : saved.last + 1]],
-        }
-        for lane, point, states in zip(
-            segment.signal_lane, segment.signal_point, segment.signal_state, strict=True
-        )
-    ]
-    return {
-        "segment": segment.segment_id,
-        "rollout": rollout,
-        "dt": float(segment.dt),
-        "steps": saved.steps,
-        "failed": saved.failed.get(rollout),
-        "agents": agents,
-        "lights": lights,
-        "map": {name: lines(getattr(segment.road, name)) for name in ("lanes", "boundary", "marks")},
-    }
+    road = {name: getattr(segment.road, name) for name in ("lanes", "boundary", "marks")}
+    plain = {name: [(x[k][:, :2] + origin).tolist() for k in range(len(x))] for name, x in road.items()}
+    lights = []
+    for light, lane in enumerate(segment.signal_lane.tolist()):
+        shown = segment.signal_state[light, saved.start : saved.last + 1].tolist()
+        names = [SignalState(state).name.lower() for state in shown]
+        stop = (segment.signal_point[light, :2] + origin).tolist()
+        lights.append({"lane": lane, "stop": stop, "states": names})
+    found: dict[str, Any] = {"segment": segment.segment_id, "rollout": rollout, "dt": float(segment.dt)}
+    found |= {"steps": saved.steps, "failed": saved.failed.get(rollout), "agents": agents}
+    return found | {"lights": lights, "map": plain}

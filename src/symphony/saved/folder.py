@@ -8,6 +8,7 @@ import hashlib
 import json
 import math
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, fields
@@ -27,42 +28,30 @@ from symphony.errors import ConfigError, DataError
 from symphony.files import Lock, naming, replacing, write_json
 from symphony.saved.rollouts import SavedRollouts, SavedTrees
 
-KEY = "symphony"
-"""The name of the JSON in the header of a file."""
+KEY = "symphony"  # the name of the JSON in the header of a file
+MAX_LENGTH = 100_000  # rollouts, steps or agents
+# Metres, radians and m/s that a simulated state may have: some times those of a log, as nobody steers it back.
 MAX_STATE = {"x": 1e5, "y": 1e5, "heading": 1e4, "speed": 1e3}
-"""Metres, radians and m/s that a simulated state may have: some times those of a log, as nobody steers it back."""
-MAX_LENGTH = 100_000
-"""Rollouts, steps or agents."""
-
-_SCALARS = {
-    **dict.fromkeys(("segment_id", "source", "file", "group"), str),
-    **{"dt": float, "ego": int, "current_step": int},
-}
+_SCALARS: dict[str, type] = dict.fromkeys(("segment_id", "source", "file", "group"), str)
+_SCALARS |= {"dt": float, "ego": int, "current_step": int}
 # Types (b bool, f float32, i int64), and shapes by letter: K rollouts, N driven agents, T steps, U = T + 1; R trees,
 # S branches, P periods, L leaves.
 _TYPES = {"b": np.bool_, "f": np.float32, "i": np.int64}
-_SHAPES = {
-    **{"agents": "iN", "state": "fKUN4", "goal": "iKN"},
-    **dict.fromkeys(("counted", "collision", "offroad"), "bKTN"),
-}
-_TREE_SHAPES = {
-    **{"state": "fRSTN4", "score": "fRSTN", "totals": "fRPS", "parents": "iRPS", "slots": "iRPL"},
-    **dict.fromkeys(("there", "collision", "offroad"), "bRSTN"),
-}
+_SHAPES = {"agents": "iN", "state": "fKUN4", "goal": "iKN"}
+_SHAPES |= dict.fromkeys(("counted", "collision", "offroad"), "bKTN")
+_TREE_SHAPES = {"state": "fRSTN4", "score": "fRSTN", "totals": "fRPS", "parents": "iRPS", "slots": "iRPL"}
+_TREE_SHAPES |= dict.fromkeys(("there", "collision", "offroad"), "bRSTN")
 
 FORMAT = 1
-MANIFEST, INDEX, SEGMENTS = "manifest.json", "index.jsonl", "segments"
-LOCK = "rollouts.lock"
-LATER = ("weights", "specification", "planner", "planner_seconds")
-"""Settings that a manifest has since November 2026."""
+MANIFEST, INDEX, SEGMENTS, LOCK = "manifest.json", "index.jsonl", "segments", "rollouts.lock"
+LATER = ("weights", "specification", "planner", "planner_seconds")  # settings kept since November 2026
 _KINDS = {"agent": str, "seed": int, "drivers": dict, "settings": dict, "store": dict}
 
 
 @dataclass(frozen=True)
 class About:
-    """Facts that all rollouts of a folder have in common: the name of what is evaluated, the seed of everything drawn
-    at random, who drove whom, such as ``{"interactive": "bc", "others": "playback"}``, the settings of the
-    simulation, as JSON can hold them, and ``path`` and ``checksum`` of the store of run segments.
+    """Facts that all rollouts of a folder have in common: the name of what is evaluated, the seed, who drove whom,
+    such as ``{"interactive": "bc", "others": "playback"}``, settings, and ``path`` and ``checksum`` of the store.
     """
 
     agent: str
@@ -72,16 +61,14 @@ class About:
     store: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, agent: str, store: SegmentStore, settings: Any, *, seed: int = 0, planner: str = "") -> About:
-        """The facts of rollouts of one agent beside log playback, and of a planner of the ego, if there is one; the
-        settings are a dictionary or a dataclass.
-        """
-        plain = dataclasses.asdict(settings) if dataclasses.is_dataclass(settings) else settings  # type: ignore[arg-type]
+    def of(
+        cls, agent: str, store: SegmentStore, settings: Mapping[str, Any], *, seed: int = 0, planner: str = ""
+    ) -> About:
+        """The facts of rollouts of one agent beside log playback, and of a planner of the ego, if there is one."""
         drivers = {"interactive": agent, "others": "playback"}
         if planner:
             agent, drivers = f"{planner} among {agent}", {"ego": planner, **drivers}
-        # As JSON gives it back, so that an equal simulation is seen to be equal.
-        plain = json.loads(json.dumps(plain, default=str))
+        plain = json.loads(json.dumps(settings, default=str))  # as it is read back, to be compared
         return cls(agent, seed, drivers, plain, {"path": str(store.path), "checksum": store.checksum()})
 
 
@@ -99,22 +86,19 @@ class Entry:
 
 
 class RolloutWriter(AbstractContextManager["RolloutWriter"]):
-    """Adds segments to a folder of rollouts, which is made if it isn't there, and continued if the same simulation
-    was being written to it; each is on record once :meth:`add` returns. One writer at a time.
-
-    Raises:
-        DataError: the folder holds something else, or rollouts of another simulation, or another process writes it.
+    """Adds segments to a folder of rollouts, each on record once :meth:`add` returns; a DataError if the folder holds
+    something else or rollouts of another simulation, or another process writes it.
     """
 
     def __init__(self, path: str | Path, about: About) -> None:
         self.path = Path(path)
         with naming(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
-        # One who has just begun, or died then, has no manifest yet.
-        there = {held.name for held in self.path.iterdir()}
-        if there - {LOCK, SEGMENTS, INDEX} and MANIFEST not in there:
+        there = set(os.listdir(self.path))
+        if there - {LOCK, SEGMENTS, INDEX} and MANIFEST not in there:  # one that has just begun has none yet
             raise DataError("not empty and no folder of rollouts: refusing to write into it", file=self.path)
         self._lock = Lock(self.path / LOCK)
+        self.close = self._lock.close
         try:
             self._begin({"format": FORMAT, **dataclasses.asdict(about)})
         except BaseException:
@@ -128,10 +112,9 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
             changed = [name for name in manifest if manifest[name] != held.get(name)]
             if "settings" in changed and isinstance(held.get("settings"), dict):
                 now, before = manifest["settings"], held["settings"]
-                # Folders from before the later settings were kept don't say.
+                changed.remove("settings")  # folders from before the later settings were kept don't say
                 names = [name for name in {**now, **before} if name in before or name not in LATER]
-                names = [name for name in names if now.get(name) != before.get(name)]
-                changed = [name for name in changed if name != "settings"] + [f"settings.{n}" for n in names]
+                changed += [f"settings.{name}" for name in names if now.get(name) != before.get(name)]
             # One that holds nothing yet is nobody's.
             if changed and (_read_index(self.path) or any((self.path / SEGMENTS).glob("*"))):
                 message = f"holds the rollouts of another simulation, which differs in {', '.join(changed)}"
@@ -145,10 +128,6 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
             write_json(file, manifest)
         self._entries = _read_index(self.path)
 
-    def close(self) -> None:
-        """Let others write."""
-        self._lock.close()
-
     def __exit__(self, *error: object) -> None:
         self.close()
 
@@ -157,19 +136,14 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
         return segment_id in self._entries and self._entries[segment_id].failed is None
 
     def add(self, saved: SavedRollouts) -> None:
-        """Write the rollouts of one segment.
-
-        Raises:
-            DataError: they break the format, are there already, or the disk refuses.
-        """
+        """Write the rollouts of one segment; a DataError if they break the format or are there already."""
         name = saved.segment.segment_id
         if self.has(name):
             raise DataError("the rollouts of this segment are there already", file=self.path, segment=name)
         arrays, facts = tensors_of(saved)
         data = save(arrays, {KEY: json.dumps(facts, ensure_ascii=False)})
         file = f"{SEGMENTS}/{file_stem(name)}.safetensors"
-        # What can't be read back must not be written.
-        read_tensors(data, self.path / file, name)
+        read_tensors(data, self.path / file, name)  # or it must not be written
         with replacing(self.path / file) as draft:
             draft.write_bytes(data)
         self._record(Entry(name, saved.rollouts, file, hashlib.sha256(data).hexdigest(), saved.segment.dt))
@@ -191,11 +165,7 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
 
 
 class RolloutFolder:
-    """Read access to a folder of rollouts: ``folder[i]`` reads and checks that segment only.
-
-    Raises:
-        DataError: no such folder, of another version, or damaged.
-    """
+    """Read access to a folder of rollouts: ``folder[i]`` reads that segment only; what is damaged is a DataError."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -211,9 +181,8 @@ class RolloutFolder:
     def only(self, segments: Iterable[str]) -> RolloutFolder:
         """The folder with some of its segments only."""
         wanted, found = set(segments), copy.copy(self)
-        found.entries, found.failures = (
-            [entry for entry in kind if entry.segment in wanted] for kind in (self.entries, self.failures)
-        )
+        found.entries = [entry for entry in self.entries if entry.segment in wanted]
+        found.failures = [entry for entry in self.failures if entry.segment in wanted]
         return found
 
     def __len__(self) -> int:
@@ -225,9 +194,7 @@ class RolloutFolder:
         try:
             data = file.read_bytes()
         except OSError as error:
-            raise DataError(
-                f"can't be read: {error.strerror or error}", file=file, segment=segment
-            ) from error
+            raise DataError(f"can't be read: {error.strerror}", file=file, segment=segment) from error
         if hashlib.sha256(data).hexdigest() != entry.sha256:
             raise DataError("damaged: not what was written", file=file, segment=segment, field="sha256")
         return read_tensors(data, file, segment)
@@ -256,9 +223,7 @@ def save_rollouts(path: str | Path, about: About, found: Iterable[SavedRollouts]
     return RolloutFolder(path)
 
 
-def load_rollouts(path: str | Path) -> RolloutFolder:
-    """Open a folder of rollouts; each segment is checked as it is read."""
-    return RolloutFolder(path)
+load_rollouts = RolloutFolder
 
 
 def file_stem(segment_id: str) -> str:
@@ -292,8 +257,8 @@ def _read_index(path: Path) -> dict[str, Entry]:
             entry = from_dict(Entry, json.loads(line))
         except (ConfigError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise DataError(f"line {number} is damaged ({error})", file=file) from error
-        inside = entry.file.startswith(f"{SEGMENTS}/") and entry.file.count("/") == 1
-        named = entry.failed is not None or (inside and entry.file.isprintable())
+        folder, _, name = entry.file.partition("/")
+        named = entry.failed is not None or (folder == SEGMENTS and "/" not in name and name.isprintable())
         if not named or not 0 <= entry.rollouts <= MAX_LENGTH:
             wrong = f"{entry.rollouts} rollouts" if named else "names no file of this folder"
             raise DataError(f"line {number}: {wrong}", file=file, segment=entry.segment)
@@ -316,23 +281,16 @@ def tensors_of(saved: SavedRollouts) -> tuple[dict[str, NDArray[Any]], dict[str,
     facts: dict[str, Any] = {name: kind(getattr(segment, name)) for name, kind in _SCALARS.items()}
     facts |= {"start": saved.start, "drivers": list(saved.drivers)}
     facts["failed"] = {str(number): reason for number, reason in saved.failed.items()}
-    if trees is not None:
-        facts["prune_every"] = int(trees.prune_every)
+    facts |= {} if trees is None else {"prune_every": int(trees.prune_every)}
     # Only contiguous arrays are written as they are meant.
     return {name: np.ascontiguousarray(value) for name, value in arrays.items()}, facts
 
 
 def read_tensors(data: bytes, file: Path, segment_id: str) -> SavedRollouts:
-    """Saved rollouts from the bytes of their file.
-
-    Raises:
-        DataError: damaged, something missing, of a wrong type or shape, not finite, or out of range; names the file,
-            the segment and the field.
-    """
+    """Saved rollouts from the bytes of their file; a DataError names the segment and the field that is wrong."""
     try:
         arrays = load(data)
-        # A safetensors file begins with the length of its header as 8 bytes.
-        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])  # after its length as 8 bytes
         saved = _assembled(arrays, json.loads(header["__metadata__"][KEY]))
         _check(saved, segment_id)
         return saved
@@ -352,8 +310,7 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
     for name, kind in (kinds | {"prune_every": int} if "prune_every" in facts else kinds).items():
         if type(facts[name]) is not kind:
             raise DataError(f"is {facts[name]!r:.80}, which is of the wrong type", field=name)
-    # Thousands of digits would be no number to Python either.
-    if not all(number.isascii() and number.isdigit() and len(number) < 10 for number in facts["failed"]):
+    if not all(re.fullmatch("[0-9]{1,9}", number) for number in facts["failed"]):
         raise DataError("must name rollouts by number", field="failed")
     if not all(isinstance(name, str) for name in facts["drivers"]):
         raise DataError("must be names", field="drivers")
@@ -375,16 +332,11 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
         # Files of before November 23, 2026 don't say who is there.
         arrays.setdefault("tree.there", np.ones(arrays["tree.offroad"].shape, np.bool_))
         trees = built(SavedTrees, "tree.", prune_every=facts["prune_every"])
-    scalars = {name: facts[name] for name in _SCALARS}
-    return built(
-        SavedRollouts,
-        "",
-        segment=built(RunSegment, "log.", road=built(RoadMap, "road."), **scalars),
-        start=facts["start"],
-        drivers=tuple(facts["drivers"]),
-        failed={int(number): str(reason) for number, reason in facts["failed"].items()},
-        trees=trees,
-    )
+    road, scalars = built(RoadMap, "road."), {name: facts[name] for name in _SCALARS}
+    segment, drivers = built(RunSegment, "log.", road=road, **scalars), tuple(facts["drivers"])
+    failed = {int(number): str(reason) for number, reason in facts["failed"].items()}
+    held = {"segment": segment, "start": facts["start"], "drivers": drivers, "failed": failed, "trees": trees}
+    return built(SavedRollouts, "", **held)
 
 
 def _check(saved: SavedRollouts, segment_id: str) -> None:
@@ -392,19 +344,14 @@ def _check(saved: SavedRollouts, segment_id: str) -> None:
     size = {"4": 4}
     for name, shape in _SHAPES.items():
         _check_shape(name, getattr(saved, name), shape, size)
-    points, offsets = routes.points, routes.offsets
-    whole = offsets[0] == 0 and offsets[-1] == len(points)
-    whole &= bool((offsets[1:] >= offsets[:-1]).all())  # differences of damaged ones can overflow
+    points, offsets = routes.points, routes.offsets  # differences of damaged ones can overflow
+    whole = offsets[0] == 0 and offsets[-1] == len(points) and bool((offsets[1:] >= offsets[:-1]).all())
     outside = f"steps {saved.start} to {saved.last} are outside the {segment.num_steps} of the log"
     demanded = [
         ("segment_id", segment.segment_id == segment_id, f"is of segment {segment.segment_id}"),
         ("state", size["U"] == size["T"] + 1, f"{size['U']} states for {size['T']} steps"),
         ("agents", len(np.unique(saved.agents)) == len(saved.agents), "names an agent twice"),
-        (
-            "agents",
-            _inside(saved.agents, 0, segment.num_agents),
-            f"outside the {segment.num_agents} of the log",
-        ),
+        ("agents", _inside(saved.agents, 0, segment.num_agents), "is outside the agents of the log"),
         ("routes", whole, "offsets do not match the points"),
         ("routes", points.dtype == np.float32 and points.shape[1:] == (3,), "must be float32 [P, 3]"),
         ("routes", bool(np.isfinite(points).all()), "holds numbers that are not finite"),
@@ -442,16 +389,15 @@ def _check(saved: SavedRollouts, segment_id: str) -> None:
 
 def _check_shape(name: str, value: NDArray[Any], wanted: str, size: dict[str, int]) -> None:
     """Check type and shape; a letter that is new takes the size it meets."""
-    dtype, shape = _TYPES[wanted[0]], wanted[1:]
+    dtype, letters, shape, message = np.dtype(_TYPES[wanted[0]]), wanted[1:], list(value.shape), ""
     if value.dtype != dtype:
-        raise DataError(f"dtype {value.dtype}, expected {np.dtype(dtype)}", field=name)
-    if value.ndim != len(shape) or max(value.shape) > MAX_LENGTH:  # arrays without elements have any shape
-        message = f"shape {list(value.shape)}, expected {len(shape)} dimensions of at most {MAX_LENGTH}"
+        message = f"dtype {value.dtype}, expected {dtype}"
+    elif len(shape) != len(letters) or max(shape) > MAX_LENGTH:  # arrays without elements have any shape
+        message = f"shape {shape}, expected {len(letters)} dimensions of at most {MAX_LENGTH}"
+    elif wrong := [(n, size[k]) for k, n in zip(letters, shape, strict=True) if size.setdefault(k, n) != n]:
+        message = f"shape {shape}: {wrong[0][0]} where {wrong[0][1]} is expected"
+    if message:
         raise DataError(message, field=name)
-    for letter, length in zip(shape, value.shape, strict=True):
-        if size.setdefault(letter, length) != length:
-            message = f"shape {list(value.shape)}: {length} where {size[letter]} is expected"
-            raise DataError(message, field=name)
 
 
 def _inside(values: NDArray[Any], low: int, high: int) -> bool:

@@ -26,10 +26,8 @@ if TYPE_CHECKING:  # who only reads rollouts waits for no torch
     from symphony.envs.scene import SceneBatch
     from symphony.rollouts.unroll import Rollouts
 
-PLAYBACK = "playback"
-"""The driver of every agent of the log that is not named."""
-BACKGROUND = "background:"
-"""The begin of the names of drivers whose agents nobody evaluates."""
+PLAYBACK = "playback"  # the driver of every agent of the log that is not named
+BACKGROUND = "background:"  # the begin of the names of drivers whose agents nobody evaluates
 
 
 @dataclass(frozen=True)
@@ -38,9 +36,7 @@ class SavedTrees:
 
     Attributes:
         state: [R, S, T, N, 4] x, y, heading, speed after each step, by the slot that simulated it.
-        there: [R, S, T, N] whether the agent is there then (in open traffic agents come and go).
-        collision: [R, S, T, N].
-        offroad: [R, S, T, N].
+        there: [R, S, T, N] whether the agent is there then, as are ``collision`` and ``offroad``.
         score: [R, S, T, N] of those states, high is bad; NaN where there is none.
         totals: [R, P, S] what the pruning after each period compared.
         parents: [R, P, S] after period p slot s was continued from slot ``parents[p, s]``.
@@ -67,9 +63,8 @@ class SavedRollouts:
         segment: the log, its map and its lights.
         agents: [N] rows of the log that were driven; all others play back the log.
         state: [K, T + 1, N, 4] x, y, heading, speed, the first state included.
-        counted: [K, T, N] steps at which an agent is there, up to the end of a rollout that failed.
-        collision: [K, T, N].
-        offroad: [K, T, N].
+        counted: [K, T, N] steps at which an agent is there, up to the end of a rollout that failed; of the same shape
+            are ``collision`` and ``offroad``.
         goal: [K, N] line of ``routes`` that an agent followed, -1 for none.
         routes: points of the routes; z is 0.
         start: step of the log at which the first state lies.
@@ -93,9 +88,7 @@ class SavedRollouts:
 
     @property
     def there(self) -> NDArray[np.bool_]:
-        """[K, T + 1, N] which agents are there at each state: at the first one where the second counts and the log
-        has them, too, as who enters with the first step was not there before.
-        """
+        """[K, T + 1, N] who is there at each state: at the first one where the second counts and the log has them."""
         first = self.counted[:, :1] & self.segment.valid[self.agents, self.start]
         return np.concatenate([first, self.counted], 1)
 
@@ -112,12 +105,12 @@ class SavedRollouts:
 
     @property
     def rollouts(self) -> int:
-        """K."""
+        """Number of rollouts, K."""
         return len(self.state)
 
     @property
     def steps(self) -> int:
-        """T."""
+        """Number of simulated steps, T."""
         return self.state.shape[1] - 1
 
     @property
@@ -128,8 +121,7 @@ class SavedRollouts:
 
 class World(NamedTuple):
     """Everyone in one rollout, A agents at U states: position [A, U, 2], heading [A, U], velocity [A, U, 2], who is
-    there [A, U], length and width [A, 2], height and level [A, U, 2] (see :mod:`symphony.data.levels`), None where
-    the map has no levels.
+    there [A, U], length and width [A, 2], height and level [A, U, 2] (:mod:`symphony.data.levels`) if known.
     """
 
     position: NDArray[np.float64]
@@ -148,10 +140,8 @@ class World(NamedTuple):
 def world_of(saved: SavedRollouts, rollout: int) -> World:
     """Everyone in one rollout: driven agents where they were driven, all others as logged."""
     segment, agents, within = saved.segment, saved.agents, slice(saved.start, saved.last + 1)
-    position, heading, velocity = (
-        part[:, within].astype(np.float64)
-        for part in (segment.position[..., :2], segment.heading, segment.velocity)
-    )
+    logged = (segment.position[..., :2], segment.heading, segment.velocity)
+    position, heading, velocity = (part[:, within].astype(np.float64) for part in logged)
     valid, there = segment.valid[:, within].copy(), saved.there[rollout].T
     state = np.where(there[..., None], saved.state[rollout].swapaxes(0, 1), 0).astype(np.float64)
     direction = np.stack([np.cos(state[..., 2]), np.sin(state[..., 2])], -1)
@@ -180,29 +170,20 @@ def saved_rollouts(
     others: str = "",
     failed: Mapping[int, str] | None = None,
 ) -> SavedRollouts:
-    """The rollouts [B, K, ...] of one run segment, in a row of B scenes, ready to be written; with the numbers
-    [B, K, N] of the routes that agents followed, -1 for none, a search, [B, R], of which they are the leaves, the
-    driver of all interactive agents, or of each, what drives background agents, and why rollouts failed, by number.
+    """The rollouts [B, K, ...] of one run segment, in a row of B scenes, ready to be written; with the goals
+    [B, K, N], the search [B, R] of which they are the leaves, the driver of all interactive agents, or of each, who
+    drives the background agents (``others``), and why rollouts failed, by number.
     """
     real, background = (_array(part[row]) for part in (scenes.interactive_valid, scenes.background))
     steps = min(segment.num_steps - 1, rollouts.collision.shape[-2])
     collision, offroad, counted = (_array(part[row])[:, :steps, real] for part in rollouts[1:])
     names = [driver] * len(real) if isinstance(driver, str) else driver
     names = [BACKGROUND + others if rule else name for name, rule in zip(names, background, strict=True)]
-    number, routes = _routes(scenes, row, goal, len(counted))
-    return SavedRollouts(
-        segment=segment,
-        agents=_array(scenes.interactive[row])[real],
-        state=_array(rollouts.state[row])[:, : steps + 1, real],
-        counted=counted,
-        collision=collision,
-        offroad=offroad,
-        goal=number[:, real],
-        routes=routes,
-        drivers=tuple(name for name, there in zip(names, real, strict=True) if there),
-        failed=dict(failed or {}),
-        trees=None if search is None else _trees(search, row, steps, real),
-    )
+    line, routes = _routes(scenes, row, goal, len(counted))
+    agents, state = _array(scenes.interactive[row])[real], _array(rollouts.state[row])[:, : steps + 1, real]
+    about: dict[str, Any] = {"drivers": tuple(np.array(names, object)[real]), "failed": dict(failed or {})}
+    about["trees"] = None if search is None else _trees(search, row, steps, real)
+    return SavedRollouts(segment, agents, state, counted, collision, offroad, line[:, real], routes, **about)
 
 
 def _array(part: Tensor) -> NDArray[Any]:
@@ -227,14 +208,11 @@ def _routes(
 def _trees(search: BeamSearchResult, row: int, steps: int, real: NDArray[np.bool_]) -> SavedTrees:
     if search.tree is None:
         raise ValueError("the search did not keep its tree")
-    state, there, collision, offroad = (
-        _array(search.tree.get(("next", *key))[row])[:, :, :steps, real]
-        for key in (keys.STATE, keys.VALID, keys.COLLISION, keys.OFFROAD)
-    )
+    names = (keys.STATE, keys.VALID, keys.COLLISION, keys.OFFROAD)
+    kept = [search.tree.get(("next", *key)) for key in names] + [search.simulated_scores]
+    state, there, hit, off, score = (_array(part[row])[:, :, :steps, real] for part in kept)
     periods = math.ceil(steps / search.prune_every)
-    totals, parents, slots = (
-        _array(part[row])[:, :periods] for part in (search.totals, search.parents, search.slots)
-    )
-    score = _array(search.simulated_scores[row])[:, :, :steps, real]
-    hit, off = collision[..., 0], offroad[..., 0]
-    return SavedTrees(state, there, hit, off, score, totals, parents, slots, search.prune_every)
+    rest = (search.totals, search.parents, search.slots)
+    totals, parents, slots = (_array(part[row])[:, :periods] for part in rest)
+    hit, off, every = hit[..., 0], off[..., 0], search.prune_every
+    return SavedTrees(state, there, hit, off, score, totals, parents, slots, every)

@@ -27,10 +27,8 @@ from symphony.rollouts.workers import batches, naming, segments_together, shared
 from symphony.saved.folder import About, RolloutFolder, RolloutWriter
 from symphony.saved.rollouts import PLAYBACK, SavedRollouts, saved_rollouts
 
-_MEMORY = ("batch", "device", "metric", "workers", "engine")
-"""Settings that change no rollout."""
-PLANNED = 16
-"""Run segments simulated at a time with a planner, of which each rollout has a copy."""
+_MEMORY = ("batch", "device", "metric", "workers", "engine")  # settings that change no rollout
+PLANNED = 16  # run segments simulated at a time with a planner, of which each rollout has a copy
 
 
 def save_simulation(
@@ -46,13 +44,10 @@ def save_simulation(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RolloutFolder:
     """Simulate an agent on every run segment of a dataset, which has routes if there are goals or a planner, and keep
-    the rollouts in a folder, segment by segment.
-
-    What was cut short goes on where it stopped: rollouts depend on the seed and the segment, not on the batch. Of a
-    search all branches are kept with their scores, if asked for; log playback is kept as it is.
+    the rollouts, and on demand all branches of the search, in a folder. What was cut short goes on where it stopped.
 
     A planner (see :func:`symphony.planners.interface.planner_maker`) drives the ego, the agent the other interactive
-    agents, without a search unless one is asked for. It has so many seconds for one answer; more fails the run.
+    agents, without a search unless one is asked for. More than ``planner_seconds`` for an answer fails the run.
     Segments whose ego can't be driven are put on record as failed. Goals of agents are those of
     :func:`symphony.rollouts.control.given_goals`. ``progress`` is called with the segments done and their total.
 
@@ -101,25 +96,18 @@ def _drive(
         scenes = dataset.scenes(items).to(torch.device(config.device))
         segments = [dataset.segment(i) for i in items]
         drivers = [PLAYBACK if agent.policy is None else agent.name] * scenes.interactive.shape[1]
-        egos = given = None
+        given = given_goals(goals, segments, scenes, planned=bool(planner)) if goals else None
+        egos = None
         if planner:
             drivers[0] = planner_name(planner)
             egos = EgoPlanners(drivers[0], planner_maker(planner), segments, planner_seconds)
-        if goals:
-            given = given_goals(goals, segments, scenes, planned=bool(planner))
         found = simulate_batch(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
         rollouts, on_cpu = found.rollouts.cpu(), scenes.cpu()
+        about: dict[str, Any] = {"goal": found.goal, "driver": drivers, "others": config.others}
+        about["search"] = found.search if keep_tree else None
         return [
             saved_rollouts(
-                segment,
-                on_cpu,
-                rollouts,
-                b,
-                goal=found.goal,
-                search=found.search if keep_tree else None,
-                driver=drivers,
-                others=config.others,
-                failed=found.failed[b] if found.failed else None,
+                segment, on_cpu, rollouts, b, failed=found.failed[b] if found.failed else None, **about
             )
             for b, segment in enumerate(segments)
         ]
@@ -138,9 +126,7 @@ def has_ego(writer: RolloutWriter, dataset: SceneDataset, item: int, rollouts: i
 
 
 def plain_settings(config: EvaluateConfig, agent: Agent, interactive: int, duration: float) -> dict[str, Any]:
-    """Settings that change what is simulated, with the agent's own where the configuration leaves them to it, and
-    digests of its weights and of what it is built and searched by.
-    """
+    """Settings that change what is simulated, those left to the agent filled in, and digests of weights and spec."""
     found = dataclasses.asdict(config)
     found |= {"interactive": config.interactive or interactive, "duration": config.duration or duration}
     found = {name: value for name, value in found.items() if name not in _MEMORY}
