@@ -224,6 +224,7 @@ def save_rollouts(path: str | Path, about: About, found: Iterable[SavedRollouts]
 
 
 load_rollouts = RolloutFolder
+"""Opens a folder of rollouts; each segment is checked as it is read."""
 
 
 def file_stem(segment_id: str) -> str:

@@ -105,12 +105,11 @@ def _drive(
         rollouts, on_cpu = found.rollouts.cpu(), scenes.cpu()
         about: dict[str, Any] = {"goal": found.goal, "driver": drivers, "others": config.others}
         about["search"] = found.search if keep_tree else None
-        return [
-            saved_rollouts(
-                segment, on_cpu, rollouts, b, failed=found.failed[b] if found.failed else None, **about
-            )
-            for b, segment in enumerate(segments)
-        ]
+        saved = []
+        for b, segment in enumerate(segments):
+            failed = found.failed[b] if found.failed else None
+            saved.append(saved_rollouts(segment, on_cpu, rollouts, b, failed=failed, **about))
+        return saved
 
 
 def has_ego(writer: RolloutWriter, dataset: SceneDataset, item: int, rollouts: int) -> bool:
