@@ -77,6 +77,20 @@ def test_a_fixed_batch_runs_in_torchrls_collector():
     assert batches[0]["next", "done"].sum(1).flatten().tolist() == [1, 1, 1]
 
 
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+def test_double_by_default_changes_no_number(dynamics):
+    found, plan = [], actions(make_env(dynamics=dynamics), (2, 3), seed=3)
+    for dtype in (torch.float32, torch.float64):
+        torch.set_default_dtype(dtype)
+        try:
+            env = make_env(dynamics=dynamics)
+            found.append(run(env, env.start(torch.tensor([0, 1])), plan))
+        finally:
+            torch.set_default_dtype(torch.float32)
+    for key in (keys.STATE, keys.OWN, keys.OBJECTS, keys.POINTS):
+        torch.testing.assert_close(found[1][key], found[0][key], atol=1e-5, rtol=1e-5)
+
+
 def test_episodes_end_with_their_own_log():
     env = make_env(straight_road(steps=21), straight_road(steps=31, seed=1))
     out = run(env, env.start(torch.tensor([0, 1])), actions(env, (2, 30)))
