@@ -28,18 +28,8 @@ import numpy as np
 import torch
 
 from symphony.agents import build_agent
-from symphony.agents.agent import FILE, read_spec
+from symphony.agents.agent import CARD, FILE, FOLDER, PREFIX, choose, read_card, read_spec, split_name
 from symphony.agents.checkpoint import load_checkpoint, save_checkpoint
-from symphony.agents.choice import (
-    CARD,
-    CARD_FORMAT,
-    FOLDER,
-    PREFIX,
-    choose,
-    read_card,
-    run_folder,
-    split_name,
-)
 from symphony.cli.shared import COLUMNS
 from symphony.config import AgentSpec, EvaluateConfig, TrainConfig, read_json, to_json
 from symphony.data.generate import PRESETS
@@ -225,7 +215,7 @@ def _before(run: Path, config: TrainConfig) -> str:
     name = config.warm_start.name.partition("@")[0]
     words = f"the networks of the run `{name}`"
     beside = run.resolve().parent / name
-    folder = beside if (beside / "config.json").is_file() else run_folder(config.warm_start)
+    folder = beside if (beside / "config.json").is_file() else split_name(str(config.warm_start))[0]
     if not (folder / "config.json").is_file():
         return words
     earlier = read_run(folder)
@@ -273,7 +263,7 @@ def card_of(name: str, source: Source, config: TrainConfig, parameters: dict[str
     """
     method = method_name(config.method)
     return {
-        "format": CARD_FORMAT,
+        "format": 1,
         "name": PREFIX + name,
         "method": method,
         "about": f"{method} (see the table of methods in the README of Symphony): {_method_words(source.spec)} It "

@@ -15,10 +15,10 @@ import helpers_oracle as oracle
 from helpers_segments import crossing, straight_road
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
-from symphony.envs import ObservationConfig, SceneBatch, collate, points, scene
+from symphony.envs import ObservationConfig, SceneBatch, collate, observation, scene
 from symphony.envs.flags import collision_flags, offroad_flags, road_distance
 from symphony.envs.objects import Objects, Observers, objects_at
-from symphony.envs.points import nearest_points, observed_points
+from symphony.envs.observation import nearest_points, observed_points
 from symphony.envs.scene import Tables
 from symphony.geometry import NO_BOUNDARY, segments_of
 from symphony.geometry.cells import PointCells
@@ -30,7 +30,7 @@ FEW = ObservationConfig(num_objects=4, num_points=60)
 @pytest.fixture
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lists of points are made at the first query."""
-    monkeypatch.setattr(points, "REPAID", 1)
+    monkeypatch.setattr(observation, "REPAID", 1)
 
 
 @pytest.fixture(scope="module")

@@ -21,6 +21,7 @@ from torch import nn
 from helpers_runs import tiny
 from helpers_segments import crossing
 from helpers_store import fill
+from symphony.agents.agent import choose
 from symphony.agents.checkpoint import (
     MANIFEST,
     CheckpointError,
@@ -32,7 +33,6 @@ from symphony.agents.checkpoint import (
     prune,
     save_checkpoint,
 )
-from symphony.agents.choice import choose
 from symphony.config import ValidationConfig
 from symphony.errors import DataError, SymphonyError
 from symphony.recipes import train

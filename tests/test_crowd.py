@@ -22,9 +22,8 @@ from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.segment import AgentType
 from symphony.envs import DrivingEnv, scene
-from symphony.envs.edge import map_edge
 from symphony.envs.observation import ObservationConfig
-from symphony.envs.scene import SceneBatch
+from symphony.envs.scene import SceneBatch, map_edge
 from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
 from symphony.learning.demonstrations import SceneDataset

@@ -19,7 +19,7 @@ from symphony import keys
 from symphony.agents import build_agent
 from symphony.collectors import Systematic
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
-from symphony.envs.edge import map_edge
+from symphony.envs.scene import map_edge
 from symphony.roadgraph import LaneGraph
 
 IN_ANY_ORDER = ("objects", "objects_mask", "points", "points_mask", "gap", "gap_ahead")

@@ -22,8 +22,7 @@ from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, DrivingEnv
 from symphony.envs.objects import Observers
-from symphony.envs.observation import OBJECT_FEATURES, SELF_FEATURES, ObservationConfig
-from symphony.envs.points import observed_lights
+from symphony.envs.observation import OBJECT_FEATURES, SELF_FEATURES, ObservationConfig, observed_lights
 from symphony.envs.routes import ALONG_FEATURES, POINTS, ROUTE_FEATURES, SPACING, RouteWindow, along_route
 from symphony.envs.scene import Tables, collate
 from symphony.geometry.frames import rotate

@@ -16,7 +16,6 @@ from helpers_segments import CAR, crossing, make_road, straight_road
 from symphony import keys
 from symphony.data.segment import RunSegment
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
-from symphony.envs.edge import leaving
 from symphony.envs.objects import Objects, entering
 from symphony.envs.routes import (
     AHEAD,
@@ -32,6 +31,7 @@ from symphony.envs.routes import (
     route_choices,
     route_table,
 )
+from symphony.envs.scene import leaving
 from symphony.errors import DataWarning
 from symphony.geometry.boxes import box_gap
 from symphony.geometry.polylines import stations_along

@@ -20,7 +20,7 @@ from symphony import keys, objectives
 from symphony.agents import build_agent
 from symphony.collectors import Systematic
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
-from symphony.envs.edge import map_edge
+from symphony.envs.scene import map_edge
 from symphony.modules import SeededNoise
 from symphony.roadgraph import LaneGraph
 from symphony.rollouts.background import CarFollower

@@ -24,7 +24,7 @@ from symphony.data.segment import RunSegment, validate
 from symphony.envs import DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.flags import road_distance
 from symphony.envs.objects import rollout_heights
-from symphony.envs.points import nearest_points
+from symphony.envs.observation import nearest_points
 from symphony.envs.scene import PointType, Tables
 from symphony.evaluation import evaluate
 from symphony.geometry import LEVEL, levels_apart
@@ -229,7 +229,7 @@ def test_a_device_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is done where nothing may wait for the device, on the CPU."""
     segments = overpass(), straight_road(3, steps=STEPS)
     found = drive(*segments)[1]
-    for name in ("envs.flags", "envs.points", "envs.driving", "geometry.nearest"):
+    for name in ("envs.flags", "envs.observation", "envs.driving", "geometry.nearest"):
         monkeypatch.setattr(f"symphony.{name}.on_host", lambda _: False)
     there = drive(*segments)[1]
     for flag in (keys.COLLISION, keys.OFFROAD, ("agents", "observation", "objects_mask")):

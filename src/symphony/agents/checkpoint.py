@@ -56,8 +56,7 @@ def save_checkpoint(
 ) -> Path:
     """Write `folder/step-<step>`, with the global random states of Python, numpy and torch.
 
-    The checkpoint appears complete or not at all; one of the same step is replaced. One process may write to
-    a folder at a time.
+    The checkpoint appears complete or not at all; one of the same step is replaced. One process writes at a time.
 
     Args:
         folder: of all checkpoints of the run, made if absent.
@@ -162,11 +161,7 @@ def checkpoints(folder: Path) -> list[Path]:
 
 
 def parts_of(path: Path) -> set[str]:
-    """Names of the modules that a checkpoint holds.
-
-    Raises:
-        CheckpointError: if the folder is no complete checkpoint of this format.
-    """
+    """Names of the modules that a checkpoint holds."""
     parts = _read_manifest(path)["parts"]
     return {name.removeprefix("module.") for name in parts if name.startswith("module.")}
 
@@ -177,12 +172,8 @@ def latest(folder: Path) -> Path | None:
 
 
 def prune(folder: Path, keep: int, *, protect: Collection[int] = ()) -> None:
-    """Delete all but the last `keep` checkpoints (at least one) and those of the steps in `protect`.
-
-    What a kill in an earlier deletion has left goes too.
-
-    Raises:
-        CheckpointError: if the disk refuses.
+    """Delete all but the last `keep` checkpoints (at least one) and those of the steps in `protect`, and what a kill
+    in an earlier deletion has left; a CheckpointError if the disk refuses.
     """
     try:
         for path in checkpoints(folder)[:-keep]:
@@ -313,10 +304,8 @@ def _match(file: Path, own: Mapping[str, Any], saved: Mapping[str, Any]) -> None
 
 
 def encode(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
-    """Turn nested values into JSON; tensors and arrays go to `tensors` (copies on the CPU), named by their place.
-
-    Raises:
-        TypeError: naming the place of a value that can't be stored.
+    """Turn nested values into JSON; tensors and arrays go to `tensors` (copies on the CPU), named by their place. A
+    TypeError names the place of a value that can't be stored.
     """
     if value is None or isinstance(value, bool | int | str):
         return value
@@ -343,11 +332,7 @@ def encode(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
 
 
 def decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
-    """What :func:`encode` was given (mappings as plain dicts).
-
-    Raises:
-        KeyError, TypeError, ValueError: if it is not such a value.
-    """
+    """What :func:`encode` was given (mappings as plain dicts)."""
     if isinstance(value, list):
         return [decode(item, tensors) for item in value]
     if not isinstance(value, dict):
@@ -356,10 +341,8 @@ def decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
     if kind is None:
         return {key: decode(item, tensors) for key, item in value.items()}
     if kind in ("float", "tensor", "array"):
-        held = value["value"]
-        return (
-            float(held) if kind == "float" else tensors[held] if kind == "tensor" else tensors[held].numpy()
-        )
+        held = value["value"] if kind == "float" else tensors[value["value"]]
+        return float(held) if kind == "float" else held.numpy() if kind == "array" else held
     items = decode(value["items"], tensors)
     if kind == "dict":
         return dict(zip(decode(value["keys"], tensors), items, strict=True))
@@ -370,7 +353,7 @@ def decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
 
 def _widened(module: nn.Module, saved: dict[str, Any]) -> dict[str, Any]:
     """A state with the columns and buffers that a module has beyond it."""
-    found, buffers = dict(saved), {name for name, _ in module.named_buffers()}
+    found, buffers = dict(saved), dict(module.named_buffers())
     for name, own in module.state_dict().items():
         there = saved.get(name)
         if there is None and name in buffers:

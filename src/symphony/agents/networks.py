@@ -58,13 +58,9 @@ def _groups(spec: AgentSpec, *, route: bool) -> tuple[ElementGroup, ...]:
     along, gaps = 0, 0
     if spec.agent.features != "paper":
         along, gaps = ALONG_FEATURES * (route and spec.goals), 3 * (1 + len(FORESIGHT))
-    objects = ElementGroup(
-        keys.OBJECTS,
-        keys.OBJECTS_MASK,
-        OBJECT_FEATURES + along + gaps,
-        more_keys=(keys.ALONG,) if along else (),
-        gap_keys=(keys.GAP, keys.GAP_AHEAD) if gaps else (),
-    )
+    more: dict[str, Any] = {"more_keys": (keys.ALONG,) if along else ()}
+    more["gap_keys"] = (keys.GAP, keys.GAP_AHEAD) if gaps else ()
+    objects = ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES + along + gaps, **more)
     points = ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES)
     lights = ElementGroup(keys.LIGHTS, keys.LIGHTS_MASK, POINT_FEATURES)
     return (objects, points, lights) if spec.agent.num_lights else (objects, points)
@@ -92,21 +88,15 @@ def _policy(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     dynamics, groups = dynamics_of(spec), _groups(spec, route=True)
     if isinstance(dynamics, Bicycle):
         return modules.discrete_policy(own, groups, actions=dynamics.num_actions, **sizes)
-    scale = observation_of(spec).size_scale
-    return modules.displacement_policy(
-        own, groups, dt=spec.dt, size_scale=scale, cells=spec.agent.cells, **sizes
-    )
+    sizes |= {"size_scale": observation_of(spec).size_scale, "cells": spec.agent.cells}
+    return modules.displacement_policy(own, groups, dt=spec.dt, **sizes)
 
 
 def goal_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     """Routes from first states, by an encoder of its own (paper, section III-B)."""
-    return modules.goal_policy(
-        SELF_FEATURES,
-        _groups(spec, route=False),
-        CHOICE_FEATURES + TURN_FEATURES * (spec.agent.goal_features == "turns"),
-        hidden=spec.agent.hidden,
-        encoder=_encoder(spec),
-    )
+    features = CHOICE_FEATURES + TURN_FEATURES * (spec.agent.goal_features == "turns")
+    sizes: dict[str, Any] = {"hidden": spec.agent.hidden, "encoder": _encoder(spec)}
+    return modules.goal_policy(SELF_FEATURES, _groups(spec, route=False), features, **sizes)
 
 
 def discriminator_network(spec: AgentSpec) -> TensorDictModule:

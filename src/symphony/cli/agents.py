@@ -17,7 +17,7 @@ class Agents(shared.Command):
     json: shared.Json = None
 
     def __call__(self) -> None:
-        from symphony.agents.choice import PREFIX, pretrained_folder, pretrained_names, read_card
+        from symphony.agents.agent import PREFIX, pretrained_folder, pretrained_names, read_card
 
         names = self.names or tuple(PREFIX + name for name in pretrained_names())
         folders = [pretrained_folder(name) for name in names]

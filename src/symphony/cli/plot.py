@@ -31,7 +31,7 @@ class Curvature(shared.Command):
     def __call__(self) -> None:
         import numpy as np
 
-        from symphony.agents.choice import run_folder
+        from symphony.agents.agent import split_name
         from symphony.evaluation.records import choose_evaluation, kept_evaluations, read_run
         from symphony.evaluation.table import method_name
         from symphony.metrics import jensen_shannon
@@ -39,7 +39,7 @@ class Curvature(shared.Command):
 
         panels = {}
         for run in self.runs:
-            folder = run_folder(run)
+            folder = split_name(str(run))[0]
             method = method_name(read_run(folder)["method"])
             held = choose_evaluation(folder, kept_evaluations(folder), self.evaluation)["curvature"]
             policy, log = (np.array(held[part], dtype=np.int64) for part in ("policy", "log"))

@@ -29,7 +29,7 @@ class Train(shared.Command):
 
 def last_words(folder: Path, config: TrainConfig) -> list[str]:
     """Which checkpoint of a run is its agent and how good it is, and what to do next."""
-    from symphony.agents.choice import best_of, choose
+    from symphony.agents.agent import best_of, choose
 
     best, score = (
         best_of(choose(folder, "last")),

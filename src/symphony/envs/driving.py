@@ -14,12 +14,11 @@ from torchrl.envs import EnvBase
 
 from symphony import keys
 from symphony.envs.dynamics import Bicycle, Displacement
-from symphony.envs.edge import leaving
 from symphony.envs.flags import collision_flags, offroad_flags
 from symphony.envs.objects import Objects, entering, everyone_at, rows_of
 from symphony.envs.observation import ObservationConfig, observation_spec, observe_states
 from symphony.envs.routes import route_choices
-from symphony.envs.scene import SceneBatch, SceneSource, Tables
+from symphony.envs.scene import SceneBatch, SceneSource, Tables, leaving
 from symphony.errors import ConfigError
 from symphony.geometry.frames import with_speed
 from symphony.geometry.nearest import on_host
@@ -361,16 +360,9 @@ class DrivingEnv(EnvBase):
         row, at = now.scene.flatten(), now.step.flatten()
         moved, real, goal, progress = _flat(len(shape), now.state, now.valid, now.goal, now.progress)
         follows = self.observation.route or self.observation.along
+        along: dict[str, Tensor] = {"goal": goal, "progress": progress} if follows else {}
         seen, objects = observe_states(
-            scenes,
-            row,
-            at,
-            moved,
-            real,
-            self.observation,
-            goal=goal if follows else None,
-            progress=progress if follows else None,
-            tables=self._kept(),
+            scenes, row, at, moved, real, self.observation, tables=self._kept(), **along
         )
         index = scenes.interactive.index_select(0, row)
         with torch.no_grad():

@@ -37,14 +37,8 @@ def bicycle_step(state: States, acceleration: Reals, steering: Reals, length: Re
 
     With slip angle tan(beta) = tan(steering) / 2 (axles at equal distance from the centre), mean speed u of the
     step and wheelbase W: dheading = 2 u dt sin(beta) / W, and the centre moves u dt along heading +
-    dheading / 2 + beta. Speed never becomes negative.
-
-    Args:
-        state: x, y, heading, speed.
-        acceleration: m/s^2.
-        steering: radians of the front wheel, positive to the left.
-        length: of the box, metres.
-        dt: seconds.
+    dheading / 2 + beta. Speed never becomes negative. Acceleration in m/s^2, steering in radians of the front wheel,
+    positive to the left, length of the box in metres.
     """
     x, y, heading, speed = state.unbind(-1)
     after = (speed + acceleration * dt).clamp_min(0.0)
@@ -52,9 +46,8 @@ def bicycle_step(state: States, acceleration: Reals, steering: Reals, length: Re
     slip = torch.atan(0.5 * torch.tan(steering))
     turn = 2.0 * travel * torch.sin(slip) / (WHEELBASE * length)
     course = heading + 0.5 * turn + slip
-    return torch.stack(
-        [x + travel * torch.cos(course), y + travel * torch.sin(course), heading + turn, after], dim=-1
-    )
+    x, y = x + travel * torch.cos(course), y + travel * torch.sin(course)
+    return torch.stack([x, y, heading + turn, after], dim=-1)
 
 
 def bicycle_inverse(state: States, after: States, length: Reals, dt: float) -> tuple[Reals, Reals]:
@@ -159,11 +152,7 @@ class Bicycle:
     def step(
         self, state: Float[Tensor, "*b 4"], action: Int[Tensor, "*b"], size: Sizes, dt: float
     ) -> Float[Tensor, "*b 4"]:
-        """Apply joint action indices.
-
-        Raises:
-            IndexError: one that is none.
-        """
+        """Apply joint action indices; one that is none is an IndexError."""
         # Not by brackets, for which -1 is the last one.
         acceleration, steering = (
             values.index_select(0, action.flatten()).reshape(action.shape) for values in self.grid(state)
@@ -272,11 +261,8 @@ def _follow(
 
 
 class ConstantVelocity(TensorDictModuleBase):
-    """Keeps speed and heading: the weakest prediction a learned agent has to beat.
-
-    Args:
-        dynamics: action space to act in.
-        dt: seconds per step; needed for displacements only.
+    """Keeps speed and heading: the weakest prediction a learned agent has to beat. Displacements need the time step
+    ``dt`` in seconds.
     """
 
     in_keys = [keys.STATE]  # noqa: RUF012 - the type TensorDictModuleBase declares
@@ -299,11 +285,7 @@ class ConstantVelocity(TensorDictModuleBase):
 
 
 class RandomActions(TensorDictModuleBase):
-    """Accelerates and steers at random, every action as likely as any other.
-
-    Args:
-        dynamics: action space to act in.
-    """
+    """Accelerates and steers at random, every action as likely as any other."""
 
     in_keys = [keys.NOISE]  # noqa: RUF012
     out_keys = [keys.ACTION]  # noqa: RUF012

@@ -96,15 +96,8 @@ def objects_at(
     index: Int[Tensor, "M N"],
     index_valid: Bool[Tensor, "M N"],
 ) -> Objects:
-    """The agents of each row's scene at a step: log playback, with simulated ones put in their place.
-
-    Args:
-        scenes: the static part.
-        scene: rows of ``scenes``.
-        step: logged step (past the end of the log nothing is valid).
-        state: x, y, heading, speed of the simulated agents.
-        index: their rows among the scene's agents.
-        index_valid: which of them are real.
+    """The agents of each row's scene at a logged step (past the end of the log nothing is valid): log playback, with
+    simulated agents in the rows ``index``, those that are real, put in their place.
     """
     steps, agents = scenes.log_valid.shape[1:]
     row = scene * steps + step.clamp(max=steps - 1)
@@ -160,12 +153,8 @@ def _height(
 def rollout_heights(
     scenes: SceneBatch, state: Float[Tensor, "B K T N 4"], scene: Int[Tensor, " B"] | None = None
 ) -> Float[Tensor, "B K T N 2"] | None:
-    """Height and level of the interactive agents in states of rollouts; None where no scene has levels.
-
-    Args:
-        scenes: the static part.
-        state: of the interactive agents.
-        scene: rows of ``scenes``; by default all of them.
+    """Height and level of the interactive agents in states of rollouts, of all or some rows of the scenes; None where
+    no scene has levels.
     """
     if not scenes.agent_height.shape[1]:
         return None
@@ -182,12 +171,8 @@ def entering(objects: Objects, index: Int[Tensor, "M N"], ready: Bool[Tensor, "M
     """Which agents that are ready can enter, far enough from all others.
 
     Of several that are ready at once the earlier slot goes first: a later one is kept away from where it is, even if
-    that one can't enter either.
-
-    Args:
-        objects: everyone, those that are ready at the places where they enter.
-        index: rows of A of the driven agents.
-        ready: who wants to enter.
+    that one can't enter either. Those that are ready stand among ``objects`` where they enter; ``index`` are the rows
+    of A of the driven agents.
     """
     agents = objects.valid.shape[1]
     slot = torch.arange(index.shape[1], device=index.device).expand(index.shape)
@@ -211,10 +196,7 @@ def entering(objects: Objects, index: Int[Tensor, "M N"], ready: Bool[Tensor, "M
 def observed_objects(
     tables: Tables, objects: Objects, who: Observers, routes: RouteWindow | None
 ) -> dict[str, Tensor]:
-    """What agents see of the nearest others, by the distance between centres.
-
-    The result holds the entries of :class:`symphony.envs.observation.Observation` that are asked for.
-    """
+    """What agents see of the nearest others, by the distance between centres: the entries that are asked for."""
     config, agents = tables.config, objects.valid.shape[1]
     chosen, mask = _nearest(objects, who, config.num_objects)
     # Places among all agents there are now, and among those of all scenes.
@@ -269,17 +251,13 @@ def _features(
 
 
 def _gaps(
-    foresight: tuple[float, ...],
-    who: Observers,
-    state: Float[Tensor, "M N O 5"],
-    size: Float[Tensor, "M N O 2"],
+    foresight: tuple[float, ...], who: Observers, state: Tensor, size: Tensor
 ) -> Float[Tensor, "M N O H"]:
-    """Gaps between boxes now and at times ahead, were everyone to keep speed and course."""
+    """Gaps to boxes [M, N, O] now and at times ahead, were everyone to keep speed and course."""
     # Times come first, and components apart, so that operations run along everything else.
     times = constant((0.0, *foresight), state.dtype, state.device)[:, None, None, None]
     own = who.state[..., None, :]
-    x, y = (
-        (state[..., k] + times * state[..., 3 + k]) - (own[..., k] + times * own[..., 3 + k]) for k in (0, 1)
-    )
+    now, later = ([part[..., k] + times * part[..., 3 + k] for k in (0, 1)] for part in (own, state))
+    x, y = later[0] - now[0], later[1] - now[1]
     gap = gap_between(x, y, own[..., 2], who.size[..., None, :], state[..., 2], size)
     return gap.movedim(0, -1).contiguous()

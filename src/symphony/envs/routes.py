@@ -57,14 +57,16 @@ _CUT, _SLACK = 1.5, 3.0
 class RouteTable:
     """Feasible routes of one vehicle from where it begins."""
 
-    # [P, 2] float32 points of all routes, one route after the other, SPACING apart from beside the vehicle
-    # on
-    points: NDArray[np.float32]
-    count: NDArray[np.int64]  # [G] int64 points of each
-    # [G] bool the routes nearest to the logged trajectory; several where they part beyond its end
-    right: NDArray[np.bool_]
-    # one of these, drawn uniformly from segment and agent alone; -1 where the vehicle is on no lane
-    logged: int
+    points: NDArray[
+        np.float32
+    ]  # [P, 2] of all routes, one after the other, SPACING apart from beside the vehicle on
+    count: NDArray[np.int64]  # [G] points of each
+    right: NDArray[
+        np.bool_
+    ]  # [G] those nearest to the logged trajectory; several where they part beyond its end
+    logged: (
+        int  # one of these, drawn uniformly from segment and agent alone; -1 where the vehicle is on no lane
+    )
 
     def line(self, route: int) -> NDArray[np.float32]:
         """Points [K, 2] of one route."""
@@ -227,12 +229,8 @@ class FollowedRoutes(NamedTuple):
     def progress(
         self, position: Float[Tensor, "M N 2"], about: Float[Tensor, "M N"], moved: Float[Tensor, "M N"]
     ) -> Float[Tensor, "M N"]:
-        """Metres along the routes of the places nearest to agents, looked for around where they were before.
-
-        Args:
-            position: of the agents.
-            about: where they were, in metres along.
-            moved: metres that they have driven since.
+        """Metres along the routes of the places nearest to agents, looked for around where they were before
+        (``about``, in metres along), as they have ``moved`` so many metres since.
         """
         reach, about = _CUT * moved[..., None] + _SLACK, about[..., None]
         start = ((about / SPACING).long() - _BACK).clamp_min(0)
@@ -266,12 +264,7 @@ def route_ahead(
     """What each agent observes of its route, in its own frame.
 
     Whether it has one, how far to the left the route lies (metres / 5), its direction, then position and existence of
-    points ahead. All zero without a route.
-
-    Args:
-        state: x, y, heading, speed.
-        routes: what is seen of the agents' routes.
-        distance_scale: metres that become 1.
+    points ahead. All zero without a route. ``distance_scale`` are the metres that become 1.
     """
     position, heading = state[..., :2], state[..., 2]
     which = routes.own[..., None] + constant(AHEAD, torch.int64, position.device)
@@ -301,14 +294,8 @@ def along_route(
     side by side); how far to the left of the route (two scales) and how far beside the agent's own width; how much
     faster along the route (two scales); the share d / (d + 2) of the deceleration d in m/s^2 that keeps the agent
     behind what it closes in on; whether it is ahead. All zero beyond what is seen of the route, more than
-    :data:`BESIDE` metres from it, and without one. Every number is within [-1, 1] at any speed.
-
-    Args:
-        own: x, y, heading, velocity of the agents.
-        own_size: length and width of their boxes.
-        others: x, y, heading, velocity of the others.
-        size: length and width of the others' boxes.
-        routes: what is seen of the agents' routes.
+    :data:`BESIDE` metres from it, and without one. Every number is within [-1, 1] at any speed. States are x, y,
+    heading and velocity, sizes length and width.
     """
     # Component by component: operations on a last dimension of 2 are slow.
     x, y, speed_x, speed_y = (torch.cat([own[..., k, None], others[..., k]], -1) for k in (0, 1, 3, 4))
@@ -341,17 +328,8 @@ def along_route(
     beside = left.abs() - 0.5 * (size[..., 1] + own_size[..., None, 1])
     brake = (-faster).clamp_min(0.0).square() / (2.0 * gap.clamp_min(0.5))
     in_front = (ahead > 0).to(own.dtype)
-    scaled = [
-        (gap, 3.0),
-        (gap, 12.0),
-        (gap, 50.0),
-        (left, 1.5),
-        (left, 6.0),
-        (beside, 0.5),
-        (faster, 2.0),
-        (faster, 8.0),
-    ]
-    bounded = [(value / scale).tanh() for value, scale in scaled]
+    scales = ((gap, (3.0, 12.0, 50.0)), (left, (1.5, 6.0)), (beside, (0.5,)), (faster, (2.0, 8.0)))
+    bounded = [(value / scale).tanh() for value, each in scales for scale in each]
     features = [torch.ones_like(gap), *bounded, brake / (brake + 2.0) * in_front, in_front]
     return torch.where(known[..., None], torch.stack(features, -1), 0.0)
 
@@ -362,14 +340,8 @@ def route_choices(
     """Every feasible route as features in the agent's frame, and which of them exist.
 
     A feature vector is position, direction and existence of every :data:`STRIDE`-th of the first :data:`POINTS`
-    points. With ``turns`` also where the route begins, resolved to decimetres near the agent, and the sine of the
-    turn at every point.
-
-    Args:
-        state: x, y, heading, speed of the agents.
-        routes: [M, N, G] what each can choose from.
-        distance_scale: metres that become 1.
-        turns: whether to say more of a route.
+    points; ``distance_scale`` are the metres that become 1. With ``turns`` also where the route begins, resolved to
+    decimetres near the agent, and the sine of the turn at every point.
     """
     (point, first, count), mask = routes, routes.length > 1
     state = state[..., None, :].expand(*count.shape, state.shape[-1])

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import IntEnum
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 import shapely
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 from tensordict import TensorClass
 from torch import Tensor
@@ -22,7 +22,6 @@ from torch import Tensor
 from symphony.data.levels import Levels, agent_heights, levels_of
 from symphony.data.segment import AgentType, LaneType, MarkType, Polylines, RunSegment, SignalState
 from symphony.data.selection import interactive_agents
-from symphony.envs.edge import MapEdge, beyond
 from symphony.envs.routes import NO_ROUTES, Routes, packed, route_table
 from symphony.errors import DataError
 from symphony.geometry.cells import EdgeCells, PointCells
@@ -38,6 +37,10 @@ SPACING = 2.0
 """Metres between the points that stand for a polyline in the observation."""
 BOUNDARY_TOLERANCE = 0.02
 """Metres by which the simplified road boundary may depart from the given one."""
+MARGIN = 5.0
+"""Metres beyond the convex hull of the lanes that still belong to the map."""
+BESIDE = 2.5
+"""Metres to either side of the end of a lane within which an agent leaves by it."""
 
 
 class PointType(IntEnum):
@@ -58,6 +61,56 @@ _MARKS = {
     MarkType.CROSSWALK: PointType.CROSSWALK,
     MarkType.STOP_SIGN: PointType.STOP_SIGN,
 }
+
+
+class MapEdge(NamedTuple):
+    """Where a map ends."""
+
+    exits: NDArray[np.float32]  # [X, 4] ends of lanes that go nowhere: x, y and the direction of travel
+    # [H, 3] outward normal and offset of the sides of the convex hull of all lanes, MARGIN added: a point p is
+    # beyond where normal @ p > offset for one of them
+    hull: NDArray[np.float32]
+
+
+def map_edge(graph: LaneGraph) -> MapEdge:
+    """Where the map of a lane graph ends.
+
+    A lane goes nowhere if neither it nor a lane beside it has a successor: one that ends beside others, as on a ramp,
+    is left by a lane change.
+    """
+    exits = []
+    for lane in graph.usable_lanes.tolist():
+        together = (lane, *graph.left[lane], *graph.right[lane])
+        if not any(graph.successors[other] for other in together):
+            before, end = graph.lines[lane][-2:]
+            exits.append(np.concatenate([end, (end - before) / np.linalg.norm(end - before)]))
+    outline = shapely.MultiPoint(graph.lane_points[0]).convex_hull
+    outline = outline.buffer(MARGIN, join_style="mitre", cap_style="square")
+    corners = np.asarray(shapely.orient_polygons(outline).exterior.coords)
+    side = np.diff(corners, axis=0)
+    normal = np.stack([side[:, 1], -side[:, 0]], -1) / np.linalg.norm(side, axis=-1, keepdims=True)
+    hull = np.concatenate([normal, (normal * corners[:-1]).sum(-1, keepdims=True)], -1)
+    return MapEdge(np.array(exits, np.float32).reshape(-1, 4), hull.astype(np.float32))
+
+
+def beyond(position: NDArray[np.floating], edge: MapEdge) -> NDArray[np.bool_]:
+    """Whether positions [..., 2] lie outside of the hull."""
+    return np.asarray((position @ edge.hull[:, :2].T > edge.hull[:, 2]).any(-1))
+
+
+def leaving(before: Tensor, after: Tensor, exits: Tensor, hull: Tensor) -> Bool[Tensor, "M N"]:
+    """Whether a step of agents [M, N, 2] led out of the map: over the end of an exit [M, X, 4], or out of the hull
+    [M, H, 3]. Padding is all zeros.
+    """
+    end, ahead = exits[:, None, :, :2], exits[:, None, :, 2:]
+    start, stop = before[:, :, None] - end, after[:, :, None] - end
+    along, along_after = (start * ahead).sum(-1), (stop * ahead).sum(-1)
+    crosses = (along <= 0) & (along_after > 0)
+    share = along / torch.where(crosses, along - along_after, -torch.ones_like(along))
+    where = start + share[..., None] * (stop - start)
+    aside = where[..., 0] * ahead[..., 1] - where[..., 1] * ahead[..., 0]
+    outside = (after[:, :, None] * hull[:, None, :, :2]).sum(-1) > hull[:, None, :, 2]
+    return (crosses & (aside.abs() <= BESIDE)).any(-1) | outside.any(-1)
 
 
 class SceneSource(Protocol):
@@ -85,19 +138,15 @@ class SceneBatch(TensorClass):
 
     Fields begin with the batch dimension, which their comments leave out. Routes are empty (R = 0) where not asked
     for. Heights and levels, see :mod:`symphony.data.levels`, are empty where no map has roads above each other; exits
-    and hull, see :class:`symphony.envs.edge.MapEdge`, where the same agents are driven from the first step to the
+    and hull, see :class:`MapEdge`, where the same agents are driven from the first step to the
     last.
     """
 
-    log_state: (
-        Tensor  # [T, A, 5] x, y, heading, velocity x, velocity y (step-major, so that one step is one row)
-    )
+    log_state: Tensor  # [T, A, 5] x, y, heading, velocity x, velocity y
     log_valid: Tensor  # [T, A]
     box_size: Tensor  # [A, 2] length, width
     agent_type: Tensor  # [A] int64
-    persona: (
-        Tensor  # [A, 2] headway and speed among the agents of the log, from -1 to 1; 0 where not measured
-    )
+    persona: Tensor  # [A, 2] headway and speed among logged agents, from -1 to 1; 0 if not measured
     interactive: Tensor  # [N] int64 rows of A; 0 for padding
     interactive_valid: Tensor  # [N]
     enter: Tensor  # [N] int64 step at which the log brings an agent in; 0 for those there from the start
@@ -106,9 +155,7 @@ class SceneBatch(TensorClass):
     hull: Tensor  # [H, 3] outline of the map
     last_step: Tensor  # [] int64, the segment's last logged step
     point: Tensor  # [P, 2]
-    point_direction: (
-        Tensor  # [P, 2] unit vector along the line; of a light from its stop point along its lane
-    )
+    point_direction: Tensor  # [P, 2] unit vector along the line, of a light along its lane
     point_type: Tensor  # [P] uint8, PointType
     point_speed: Tensor  # [P] speed limit of the lane, m/s, 0 where unknown
     point_light: Tensor  # [P] int16 row of Q for lights, else -1
@@ -125,9 +172,7 @@ class SceneBatch(TensorClass):
     stream: Tensor  # [] int64 hash of the segment id, the root of the scene's random numbers
     segment: Tensor  # [] int64 number of the run segment among those that scenes are drawn from
     dt: Tensor  # [] float64 seconds per step, the same in all scenes of a batch
-    route_point: (
-        Tensor  # [R, 2] points of the feasible routes of the interactive agents, one route after the other
-    )
+    route_point: Tensor  # [R, 2] points of the feasible routes of the interactive agents, one after the other
     route_first: Tensor  # [N, G] int64 place of the first point of each route
     route_count: Tensor  # [N, G] int64 points of each; 0 for padding
     route_logged: Tensor  # [N] int64 the route nearest to what the log shows, -1 for none
@@ -253,9 +298,16 @@ def collate(scenes: Sequence[SceneBatch], agents: int = 0) -> SceneBatch:
     return SceneBatch(**fields, batch_size=[len(fields["stream"])])
 
 
-_INDEX_FIELDS = {"point_light", "edge_previous", "edge_following"}
-_ROUTES = {"route_first", "route_count", "route_logged"}
-_AGENT_FIELDS = {"interactive", "interactive_valid", "enter", "background", *_ROUTES}
+_INDEX_FIELDS = ("point_light", "edge_previous", "edge_following")
+_AGENT_FIELDS = [
+    "interactive",
+    "interactive_valid",
+    "enter",
+    "background",
+    "route_first",
+    "route_count",
+    "route_logged",
+]
 
 
 def _edges(boundary: Polylines, levels: Levels) -> dict[str, NDArray[Any]]:
@@ -269,8 +321,7 @@ def _edges(boundary: Polylines, levels: Levels) -> dict[str, NDArray[Any]]:
     pair = np.flatnonzero((line[1:] == line[:-1]) & (points[1:, :2] != points[:-1, :2]).any(-1))
     middle = (points[pair] + points[pair + 1]) / 2
     return {
-        "edge_start": start,
-        "edge_end": end,
+        **{"edge_start": start, "edge_end": end},
         "edge_previous": previous.astype(np.int32),
         "edge_following": following.astype(np.int32),
         "edge_valid": np.ones(len(start), bool),
@@ -289,17 +340,18 @@ def _points(segment: RunSegment, levels: Levels) -> dict[str, NDArray[Any]]:
     road = segment.road
     bike = np.where(road.lane_type == LaneType.BIKE_LANE, PointType.BIKE_LANE, PointType.LANE)
     marks = np.array([_MARKS.get(MarkType(kind), PointType.OTHER) for kind in road.mark_type], np.int64)
-    groups: list[tuple[Polylines, NDArray[Any], NDArray[Any]]] = [
-        (road.lanes, bike, np.nan_to_num(road.speed_limit)),
-        (road.boundary, np.full(len(road.boundary), PointType.BOUNDARY), np.zeros(len(road.boundary))),
-        (road.marks, marks, np.zeros(len(road.marks))),
+    edge = np.full(len(road.boundary), PointType.BOUNDARY)
+    groups: list[tuple[Polylines, NDArray[Any], NDArray[Any]]]
+    groups = [(road.lanes, bike, np.nan_to_num(road.speed_limit))]
+    groups += [
+        (lines, kind, np.zeros(len(lines))) for lines, kind in ((road.boundary, edge), (road.marks, marks))
     ]
     lights = len(segment.signal_lane)
     ends = np.array([road.lanes[int(lane)][-1, :2] for lane in segment.signal_lane], np.float32)
     ahead = _unit(ends.reshape(-1, 2) - segment.signal_point[:, :2])
     parts = []
     for lines, types, limits in groups:
-        where, along, line = resample_lines(lines, SPACING)
+        where, along, line = _resampled(lines)
         parts.append((where, along, types[line], limits[line], np.full(len(line), -1)))
     number = np.arange(lights)
     parts.append((segment.signal_point, ahead, np.full(lights, PointType.LIGHT), np.zeros(lights), number))
@@ -316,11 +368,9 @@ def _points(segment: RunSegment, levels: Levels) -> dict[str, NDArray[Any]]:
     }
 
 
-def resample_lines(
-    lines: Polylines, spacing: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
-    """Points [P, 3] at most ``spacing`` metres apart along each line (ends included), unit directions [P, 2] and
-    the line each belongs to [P]. A line without length is one point with direction 0.
+def _resampled(lines: Polylines) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
+    """Points [P, 3] at most :data:`SPACING` apart along each line (ends included), unit directions [P, 2] and the
+    line each belongs to [P]. A line without length is one point with direction 0.
     """
     xy = lines.points.astype(np.float64)
     owner = lines.line_index
@@ -332,12 +382,12 @@ def resample_lines(
     first, last = arc[lines.offsets[:-1]], arc[lines.offsets[1:] - 1]
     length = last - first
     # A length within a thousandth of a multiple counts as that multiple, so that rounding adds no point.
-    pieces = np.maximum(np.ceil(length / spacing - 1e-3).astype(np.int64), 1)
+    pieces = np.maximum(np.ceil(length / SPACING - 1e-3).astype(np.int64), 1)
     count = np.where(length > 0, pieces + 1, 1)
     line = np.repeat(np.arange(len(lines)), count)
     share = spans(0, count) / np.maximum(count[line] - 1, 1)
     place = first[line] + share * length[line]
-    half = np.minimum(0.5 * spacing, 0.5 * length[line])
+    half = np.minimum(0.5 * SPACING, 0.5 * length[line])
     ends = np.minimum(place + half, last[line]), np.maximum(place - half, first[line])
 
     def at(where: NDArray[np.float64], axes: int) -> NDArray[np.float64]:
@@ -374,21 +424,19 @@ class Tables:
 
     @cached_property
     def points(self) -> Float[Tensor, "BP 23"]:
-        """[B P, 23] a point's features, with its position and direction in the frame of the world, in metres, in
-        the first four columns and zeros where they depend on the agent or the time.
+        """A point's features, with its position and direction in the frame of the world, in metres, in the first four
+        columns and zeros where they depend on the agent or the time.
         """
         scenes = self.scenes
-        point = scenes.point.flatten(0, 1)
-        rows = point.new_zeros(len(point), POINT_FEATURES)
-        rows[:, :2] = point
-        rows[:, 2:4] = scenes.point_direction.flatten(0, 1)
+        rows = scenes.point.new_zeros(scenes.point_valid.numel(), POINT_FEATURES)
+        rows[:, :2], rows[:, 2:4] = scenes.point.flatten(0, 1), scenes.point_direction.flatten(0, 1)
         rows[:, 4] = scenes.point_speed.flatten() / self.config.speed_scale
         rows.scatter_(1, 6 + scenes.point_type.flatten().long()[:, None], 1.0)
         return rows
 
     @cached_property
     def light(self) -> Int[Tensor, " BP"] | None:
-        """[B * P] int16 row of the lights, -1 for other points; None if there are no lights."""
+        """Row of the lights, -1 for other points; None if there are no lights."""
         return self.scenes.point_light.flatten() if self.scenes.light.shape[2] else None
 
     @cached_property

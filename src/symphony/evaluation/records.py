@@ -13,8 +13,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from symphony.agents.agent import PREFIX, choose, split_name
 from symphony.agents.checkpoint import checkpoints
-from symphony.agents.choice import choose, is_pretrained, split_name
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
 from symphony.files import write_json
@@ -135,7 +135,7 @@ def _unusual_words(config: Mapping[str, Any]) -> list[str]:
 
 def keep_evaluation(agent: str, record: dict[str, Any]) -> Path | None:
     """Write the record of an evaluation into the folder of the run, where the user has one, and return the file."""
-    if record["run"] is None or is_pretrained(agent):
+    if record["run"] is None or agent.startswith(PREFIX):
         return None
     file = split_name(agent)[0] / FOLDER / f"{evaluation_name(record)}.json"
     write_json(file, record)

@@ -23,7 +23,7 @@ from symphony.envs.objects import Objects
 from symphony.envs.routes import SPACING
 from symphony.envs.scene import PointType, SceneBatch
 from symphony.geometry.frames import wrap
-from symphony.geometry.nearest import nearest, on_host
+from symphony.geometry.nearest import nearest, places
 from symphony.geometry.polylines import NEAR
 from symphony.planners import included
 from symphony.planners.interface import MAX_BRAKING, MAX_STEERING
@@ -38,9 +38,8 @@ def constant_speed(env: DrivingEnv) -> TensorDictModule:
     """Background agents keep speed and heading."""
 
     def onward(state: Float[Tensor, "*b N 4"]) -> Float[Tensor, "*b N 4"]:
-        return torch.cat(
-            [state[..., :2] + state[..., 3:] * env.dt * _unit(state[..., 2]), state[..., 2:]], -1
-        )
+        moved = state[..., :2] + state[..., 3:] * env.dt * _unit(state[..., 2])
+        return torch.cat([moved, state[..., 2:]], -1)
 
     return TensorDictModule(onward, [keys.STATE], [keys.BACKGROUND])
 
@@ -71,20 +70,11 @@ class CarFollower(TensorDictModuleBase):
         row, at = tensordict.get(keys.SCENE).flatten(), tensordict.get(keys.STEP).flatten()
         state, valid = (tensordict.get(key).flatten(0, lead - 1) for key in (keys.STATE, keys.VALID))
         drives = scenes.background[row] & valid
-        if on_host(drives):
-            m, n = drives.nonzero(as_tuple=True)
-        else:  # a device would wait to tell whom to leave out: all others are moved, too, and put back
-            m, n = torch.cartesian_prod(*(torch.arange(k, device=row.device) for k in drives.shape)).unbind(
-                -1
-            )
+        m, n = places(drives)  # on a device all: whoever is not driven is moved, too, and put back
         everyone = self.env.objects(row, at, state, valid)
         agent = scenes.interactive[row[m], n]
-        own, size, line = (
-            state[m, n],
-            scenes.box_size[row[m], agent],
-            _Lines(*(r[row[m], n] for r in self.routes)),
-        )
-        speed = own[:, 3]
+        own, size = state[m, n], scenes.box_size[row[m], agent]
+        line, speed = _Lines(*(r[row[m], n] for r in self.routes)), own[:, 3]
         station = _own_station(line, own, self._driven(row[m], at[m], n, speed))
         gap, other = self._leader(line, everyone, m, agent, own, size, station)
         red = self._red(line, row[m], at[m], station + 0.5 * size[:, 0], speed)

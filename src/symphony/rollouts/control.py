@@ -41,9 +41,7 @@ def given_personas(personas: Float[Tensor, "M 2"] | None, asked: str) -> Float[T
     if not asked:
         return personas
     if personas is None:
-        raise ConfigError(
-            "this agent was trained without personas (agent.persona): --persona means nothing to it"
-        )
+        raise ConfigError("--persona means nothing to this agent, trained without personas (agent.persona)")
     found = personas.clone()
     for name, quantile in persona_quantiles(asked).items():
         found[:, PERSONA_PARTS.index(name)] = 2 * quantile - 1

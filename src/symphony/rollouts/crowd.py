@@ -5,6 +5,7 @@ Legend: A agents of a segment, N driven ones.
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,9 +21,8 @@ from symphony.config.evaluation import MOST, TOGETHER
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import MOVING, interactive_choice, travel
 from symphony.data.store import SegmentStore
-from symphony.envs.edge import beyond, map_edge
 from symphony.envs.routes import route_table
-from symphony.envs.scene import SceneBatch, scene
+from symphony.envs.scene import SceneBatch, beyond, map_edge, scene
 from symphony.errors import DataError, DataWarning
 from symphony.learning.demonstrations import SceneDataset
 from symphony.learning.experts import IN_LANE
@@ -79,15 +79,10 @@ class Crowd:
         driven = np.array([*order, *(rest if self.everyone else rest[moves[rest]])], np.int64)[: self.count]
         if not self.background:
             return driven, np.zeros(0, np.int64)
-        others = [
-            agent
-            for agent in (*order, *rest)
-            if agent not in driven
-            and (
-                not self.along_routes
-                or route_table(segment, graph, int(agent), int(first[agent])).logged >= 0
-            )
-        ]
+        others = [agent for agent in (*order, *rest) if agent not in driven]
+        if self.along_routes:
+            has = (route_table(segment, graph, int(agent), int(first[agent])).logged >= 0 for agent in others)
+            others = list(itertools.compress(others, has))
         return driven, np.array(others[: MOST - len(driven)], np.int64)
 
     def _near(self, segment: RunSegment, rows: Indices) -> NDArray[np.bool_]:

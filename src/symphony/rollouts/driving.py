@@ -161,16 +161,14 @@ def simulation(
         ends = result.trajectories[..., -1]  # a copy of a branch follows the goals of its parent
         goal = ends.get(keys.GOAL)
         if kind == "best":
-            chosen = max_then_sum(result.scores, result.alive[..., None]).argsort(dim=-1, stable=True)[
-                ..., :1
-            ]
+            total = max_then_sum(result.scores, result.alive[..., None])
+            chosen = total.argsort(dim=-1, stable=True)[..., :1]
         elif kind == "tree":
             tree = result
         else:  # lines are trees of one branch each; to be filled from each other they are the branches of one
             begun = result.alive.squeeze(-2)[..., :: result.prune_every]
-            totals = torch.where(
-                begun, result.totals.squeeze(-1), -torch.inf
-            )  # what follows an end is never bad
+            # What follows an end is never bad.
+            totals = torch.where(begun, result.totals.squeeze(-1), -torch.inf)
             chosen = filled_lines(totals, settings.threshold)[:, None]
             found, goal = Rollouts(*(part.transpose(1, 2) for part in found)), goal.transpose(1, 2)
     for network in (goals, guard, scorer):
@@ -203,9 +201,7 @@ def _acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfi
     """A policy with what a configuration changes in its draws, and with the rule that drives background agents."""
     if config.action_temperature != 1.0:
         if keys.LOGITS not in policy.out_keys or not env.dynamics.discrete:
-            raise ConfigError(
-                "this agent draws no discrete actions, so action-temperature means nothing to it"
-            )
+            raise ConfigError("action-temperature means nothing to this agent: it draws no discrete actions")
         policy = TensorDictSequential(policy, tempered(config.action_temperature))
     return TensorDictSequential(policy, RULES[config.others](env)) if config.others in RULES else policy
 
