@@ -95,6 +95,28 @@ def hide(segment: RunSegment, agent: int, steps: slice) -> RunSegment:
     return segment.replace(**fields)
 
 
+def turned(segment: RunSegment, angle: float, shift: Any = 0.0) -> RunSegment:
+    """The whole world turned counter-clockwise about its origin, and then moved."""
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, s], [-s, c]])
+
+    def moved(points: NDArray[Any], by: Any = shift) -> NDArray[np.float32]:
+        return np.concatenate([points[..., :2] @ turn + by, points[..., 2:]], -1).astype(np.float32)
+
+    road, there = segment.road, segment.valid
+    lines = {
+        name: Polylines(moved(old.points), old.offsets)
+        for name, old in (("lanes", road.lanes), ("boundary", road.boundary), ("marks", road.marks))
+    }
+    return segment.replace(
+        position=np.where(there[..., None], moved(segment.position), np.float32(0)),
+        velocity=moved(segment.velocity, 0.0),
+        heading=np.where(there, segment.heading + np.float32(angle), np.float32(0)),
+        signal_point=moved(segment.signal_point),
+        road=dataclasses.replace(road, **lines),
+    )
+
+
 def along(path: NDArray[Any], distance: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Position [..., 2] and heading [...] at distances [...] along a polyline [P, 2]."""
     length = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,10 @@ from hypothesis import strategies as st
 
 from helpers_argoverse2 import FAR, NAME, Columns, city, points, scenario, write
 from helpers_sources import off_road, read_error, read_one
-from symphony.data.odd import WILD
+from symphony.data.conformance import check_reader
 from symphony.data.segment import AgentType, LaneType, MarkType
 from symphony.data.sources import argoverse2, get_reader
 from symphony.data.sources.argoverse2 import EGO_ID, NO_AREA, NO_CROSSING, NO_LANE, NO_TYPE, NOMINAL_SIZES
-from symphony.errors import ConfigError
 
 IN_FOLDER = settings(
     deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -44,15 +42,20 @@ def test_tracks(tmp_path: Path) -> None:
         np.testing.assert_array_equal(segment.size[k], np.float32(NOMINAL_SIZES[kind][1]))
     # The focal track, and then the scored one.
     assert (segment.interest.tolist(), segment.predict.tolist()) == ([5], [5, 4])
-
-
-def test_a_scenario_without_its_future(tmp_path: Path) -> None:
-    """As in the test split: the number of time stamps stays, the rows end."""
+    assert check_reader(get_reader("argoverse2"), [write(tmp_path)]).segments == 1
+    # As in the test split: the number of time stamps stays, the rows end; of a type that nobody knows.
     whole = scenario()
-    keep = [k for k, observed in enumerate(whole["observed"]) if observed]
-    columns = {name: [values[k] for k in keep] for name, values in whole.items()}
-    segment = read_one("argoverse2", write(tmp_path, columns))
+    columns = {name: values[: whole["observed"].index(False)] for name, values in whole.items()}
+    put("object_type", "tram")(columns)
+    segment = read_one(
+        "argoverse2",
+        write(
+            tmp_path,
+            columns | {"track_id": ["AV"] * 8, "object_category": [3] * 8, "focal_track_id": ["AV"] * 8},
+        ),
+    )
     assert (segment.num_steps, segment.current_step, segment.dt) == (8, 7, 0.1)
+    assert (segment.odd, segment.agent_type.tolist()) == ({NO_TYPE: "'tram'"}, [AgentType.OTHER])
 
 
 def test_lane_graph(tmp_path: Path) -> None:
@@ -66,6 +69,8 @@ def test_lane_graph(tmp_path: Path) -> None:
     assert road.lane_type.tolist() == [LaneType.SURFACE_STREET] * 5 + [LaneType.BIKE_LANE]
     np.testing.assert_allclose(road.lane_width, [3.6] * 5 + [1.5], rtol=1e-6)
     assert np.isnan(road.speed_limit).all()
+    # The dashes between 10 and 20 are in the file twice, with another number of points on either side.
+    assert road.mark_type.tolist() == [MarkType.ROAD_LINE] * 3 + [MarkType.CROSSWALK]
     line = road.lanes[4] + segment.origin - [*FAR, 0]
     np.testing.assert_allclose(line, [[120, 7.2, 0], [60, 7.2, 0], [0, 7.2, 0]], atol=1e-4)
 
@@ -84,17 +89,6 @@ def test_a_missing_centre_line_is_the_middle_of_the_bounds(tmp_path: Path) -> No
         np.testing.assert_allclose(lanes[k][[0, -1]], expected[k][[0, -1]], atol=1e-4)
 
 
-def test_marks(tmp_path: Path) -> None:
-    kinds = read_one("argoverse2", write(tmp_path)).road.mark_type.tolist()
-    # The dashes between 10 and 20 are in the file twice, with another number of points on either side.
-    assert kinds == [MarkType.ROAD_LINE] * 3 + [MarkType.CROSSWALK]
-    map_ = city()
-    left = map_["lane_segments"]["10"]["left_lane_boundary"]
-    for shared in (left, left[::-1]):
-        map_["lane_segments"]["20"]["right_lane_boundary"] = shared
-        assert read_one("argoverse2", write(tmp_path, map_=map_)).road.mark_type.tolist() == kinds[1:]
-
-
 def test_the_boundary_is_open_where_the_map_is_cut(tmp_path: Path) -> None:
     segment = read_one("argoverse2", write(tmp_path))
     lines = sorted((line[[0, -1], :2] for line in map(segment.road.boundary.__getitem__, (0, 1))), key=np.max)
@@ -107,12 +101,6 @@ def test_the_boundary_is_open_where_the_map_is_cut(tmp_path: Path) -> None:
 
 
 # Bad input
-
-
-def test_a_missing_pyarrow_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"symphony-traffic\[argoverse2\]"):
-        get_reader("argoverse2")
 
 
 @IN_FOLDER
@@ -187,19 +175,6 @@ def test_bad_tracks(change: Callable[[Columns], None], field: str, tmp_path: Pat
     assert (error.file, error.segment, error.field) == (path, NAME, field)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("position_y", 1e7), ("velocity_x", 1e300), ("heading", np.inf), ("position_x", np.nan)],
-)
-def test_a_wild_state_is_left_out(name: str, value: float, tmp_path: Path) -> None:
-    columns = scenario()
-    whole = read_one("argoverse2", write(tmp_path, columns))
-    put(name, value, 30)(columns)
-    found = read_one("argoverse2", write(tmp_path, columns))
-    assert list(found.odd) == [WILD]
-    assert whole.valid.sum() - found.valid.sum() == 1
-
-
 LANE = ("lane_segments", "11")
 LEFT = (*LANE, "left_lane_boundary")
 
@@ -245,11 +220,3 @@ def test_entries_that_can_not_be_read_are_left_out(
     assert list(found.odd) == [kind]
     assert found.odd[kind].startswith(f"{keys[0]} {keys[1]}")
     assert (11 in found.road.lane_id.tolist()) == (kind != NO_LANE)
-
-
-def test_an_unknown_type_of_agent(tmp_path: Path) -> None:
-    columns = scenario()
-    put("object_type", "tram")(columns)
-    found = read_one("argoverse2", write(tmp_path, columns))
-    assert found.odd == {NO_TYPE: "'tram'"}
-    assert set(found.agent_type.tolist()) == {AgentType.OTHER}

@@ -25,7 +25,6 @@ from helpers_sources import (
 from helpers_sources import convert_xml as convert
 from symphony.data.segment import MarkType, RunSegment, SignalState, content_hash
 from symphony.data.sources import get_reader
-from symphony.data.sources.commonroad import NO_OBSTACLE
 from symphony.data.sources.lines import SLIT, drivable_rings
 
 
@@ -49,22 +48,16 @@ def test_tracks(path: Path) -> None:
     assert not segment.position[1, [0, 1, 4]].any()
 
 
-def test_the_two_versions_say_the_same(path: Path) -> None:
+def test_the_two_versions_say_the_same_and_static_obstacles_rest(path: Path) -> None:
     found = []
     for version in ("2018b", "2020a"):
-        parked = obstacle(9, [state(0, 20, -1)], version, "parkedVehicle", role="static")
+        parked = obstacle(9, [state(0, 20, -1, 0.3, 7.0)], version, "parkedVehicle", role="static")
         found.append(convert(path, ROAD, driver(7, version), driver(8, version, 9), parked, version=version))
     assert content_hash(found[0]) == content_hash(found[1])
-
-
-def test_static_obstacles_rest_at_every_step(path: Path) -> None:
-    parked = obstacle(9, [state(0, 20, -1, 0.3, 7.0)], kind="parkedVehicle", role="static")
-    segment = convert(path, ROAD, parked, driver(7))
-    assert segment.agent_id.tolist() == [7, 9]
-    assert segment.valid[1].all()
-    assert not segment.velocity[1].any()
-    np.testing.assert_allclose(segment.heading[1], 0.3)
-    np.testing.assert_allclose(segment.position[1], [[20, -1, 0]] * 5, atol=1e-5)
+    segment = found[0]
+    assert (segment.agent_id[2], segment.valid[2].all(), segment.velocity[2].any()) == (9, True, False)
+    np.testing.assert_allclose(segment.heading[2], 0.3)
+    np.testing.assert_allclose(segment.position[2] + segment.origin, [[20, -1, 0]] * 5, atol=1e-5)
 
 
 def test_a_missing_velocity_is_the_slope_of_the_positions(path: Path) -> None:
@@ -75,13 +68,6 @@ def test_a_missing_velocity_is_the_slope_of_the_positions(path: Path) -> None:
     np.testing.assert_allclose(segment.velocity[1, :, 1], 2.0, rtol=1e-4)
     single = obstacle(8, [state(2, 5, 5, 0, None)])
     assert not convert(path, ROAD, driver(7), single).velocity[1].any()
-
-
-def test_predicted_states_are_no_log(path: Path) -> None:
-    vague = state(1, 30, 1).replace(
-        "<exact>1</exact>", "<intervalStart>1</intervalStart><intervalEnd>3</intervalEnd>"
-    )
-    assert list(convert(path, ROAD, driver(7), obstacle(8, [vague])).odd) == [NO_OBSTACLE]
 
 
 POLYGON = "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in [(0, 0), (3, 0), (3, 1), (0, 1)])

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from helpers_segments import crossing, hide, segments, straight_road
+from helpers_segments import crossing, hide, segments, straight_road, turned
 from symphony.data import resample as resampling
 from symphony.data.resample import hold_lights, resample, smooth
 from symphony.data.segment import RunSegment, SignalState, content_hash, validate
@@ -68,14 +68,6 @@ def test_between_a_valid_and_an_invalid_step_nothing_is_made_up() -> None:
     assert not new.position[1, 7:12].any()
 
 
-def test_lights_keep_the_latest_logged_state() -> None:
-    log = crossing(2, steps=41, dt=0.1)
-    states = np.tile(np.arange(41, dtype=np.uint8) % 9, (12, 1))
-    new = resample(log.replace(signal_state=states), 0.15)
-    expected = (np.floor(np.arange(new.num_steps) * 1.5 + 1e-9) % 9).astype(np.uint8)
-    np.testing.assert_array_equal(new.signal_state[0], expected)
-
-
 @given(
     st.lists(st.lists(st.integers(0, 8), min_size=7, max_size=7), min_size=12, max_size=12).map(
         lambda rows: np.array(rows, np.uint8)
@@ -109,18 +101,6 @@ def test_uniform_motion_with_gaps_stays_as_it_is() -> None:
     for name in ("position", "velocity", "heading"):
         np.testing.assert_allclose(getattr(new, name), getattr(log, name), atol=2e-4)
     assert not new.position[~log.valid].any()
-
-
-def turned(log: RunSegment, angle: float, shift: float) -> RunSegment:
-    c, s = np.cos(angle), np.sin(angle)
-    matrix = np.array([[c, s], [-s, c]])
-    position = log.position.copy()
-    position[..., :2] = log.position[..., :2] @ matrix + shift
-    return log.replace(
-        position=np.where(log.valid[..., None], position, 0).astype(np.float32),
-        velocity=(log.velocity @ matrix).astype(np.float32),
-        heading=np.where(log.valid, log.heading + angle, 0).astype(np.float32),
-    )
 
 
 @settings(max_examples=25, deadline=None)

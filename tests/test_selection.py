@@ -9,13 +9,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from helpers_segments import along, crossing, hide, make_road, make_segment, straight_road
+from helpers_segments import along, crossing, hide, make_road, make_segment, straight_road, turned
 from symphony.data import selection as contexts
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import (
     CONFLICT_GAP,
     Context,
-    choices,
     exclusion,
     interactive_agents,
     interactive_choice,
@@ -134,16 +133,9 @@ def test_frame_and_order_do_not_matter(case: str, angle: float, shift: Any, rand
     context, paths = CASES[case]
     segment = scene(paths)
     order = random.sample(range(len(paths)), len(paths))
-    turn = np.asarray([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    moved = scene(paths).position.copy()
-    moved[..., :2] = moved[..., :2] @ turn + shift
-    again = segment.replace(
-        ego=order.index(0),
-        agent_id=segment.agent_id[order],
-        position=moved[order].astype(np.float32),
-        heading=np.angle(np.exp(1j * (segment.heading + angle))).astype(np.float32)[order],
-        velocity=(segment.velocity @ turn).astype(np.float32)[order],
-    )
+    moved = turned(segment, angle, shift)
+    arrays = {name: getattr(moved, name)[order] for name in ("agent_id", "position", "heading", "velocity")}
+    again = moved.replace(ego=order.index(0), **arrays)
     choice = interactive_choice(again, 2)
     assert choice.context == context
     assert again.agent_id[choice.agents].tolist() == segment.agent_id[:2].tolist()
@@ -201,24 +193,6 @@ def test_a_partner_that_is_seen_throughout_goes_first() -> None:
     assert interactive_choice(alone, 2).context == context
 
 
-def test_a_gap_in_the_track_and_no_map_do_no_harm() -> None:
-    context, paths = CASES["turns in before"]
-    segment = scene(paths[:2]).replace(road=make_road([NORTH[:1]]))
-    for agent in (0, 1):
-        assert interactive_choice(hide(segment, agent, slice(10, 13)), 2).context == context
-
-
-def test_choices_are_counted_and_named() -> None:
-    segments = [scene(paths, segment_id=name) for name, (_, paths) in CASES.items()]
-    found = choices([*segments, scene([(NORTH, north(0))], segment_id="alone")], 2)
-    assert found["count"] == 2
-    assert found["too_few"] == 1
-    assert sum(found["contexts"].values()) == len(found["segments"]) == len(CASES)
-    assert list(found["contexts"]) == ["merge", "crossing", "leader", "follower", "nearest"]
-    for name, (context, _) in CASES.items():
-        assert found["segments"][name] == {"context": context, "agents": [7, 8]}
-
-
 @pytest.mark.parametrize("tile", [60, 5 * STEPS])
 def test_tiles_of_any_size_give_the_same(tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
     turns, crosses = (TURN_RIGHT_INTO_NORTH, 12 * TIME + 60), (EAST, 15 * TIME + 120)
@@ -248,11 +222,16 @@ def ints(*values: int) -> np.ndarray:
     return np.asarray(values, np.int32)
 
 
-def test_the_nearest_that_moves_is_the_partner() -> None:
+def test_the_nearest_vehicles_that_move_and_are_seen_come_first() -> None:
     segment = abreast([30, 5, 10, 20], [2, 0.3, 2, 2])
-    assert interactive_agents(segment, 2).tolist() == [0, 3]
-    assert interactive_agents(segment, 4).tolist() == [0, 3, 4, 1]
-    assert interactive_agents(segment, 1).tolist() == [0]
+    for count, chosen in ((1, [0]), (2, [0, 3]), (4, [0, 3, 4, 1])):
+        assert interactive_agents(segment, count).tolist() == chosen
+    kinds = segment.agent_type.copy()
+    kinds[1:3] = AgentType.PEDESTRIAN, AgentType.CYCLIST
+    late = hide(segment.replace(agent_type=kinds, interest=ints(1, 3)), 3, slice(0, 1))
+    assert interactive_agents(late, 2).tolist() == [0, 4]
+    gone = hide(abreast([5, 6, 7], [2, 2, 2]), 1, slice(5, 6))
+    assert interactive_agents(gone, 4).tolist() == [0, 2, 3, 1]
 
 
 def test_marks_of_the_source_come_first() -> None:
@@ -265,20 +244,6 @@ def test_marks_of_the_source_come_first() -> None:
     assert interactive_agents(segment.replace(predict=ints(2)), 2).tolist() == [0, 3]
     # After the partner, the nearest that move.
     assert interactive_agents(segment.replace(interest=ints(2)), 4).tolist() == [0, 2, 3, 4]
-
-
-def test_only_vehicles_seen_at_the_first_step() -> None:
-    segment = abreast([5, 6, 7, 8], [2, 2, 2, 2])
-    kinds = segment.agent_type.copy()
-    kinds[1] = AgentType.PEDESTRIAN
-    kinds[2] = AgentType.CYCLIST
-    segment = hide(segment.replace(agent_type=kinds, interest=ints(1, 3)), 3, slice(0, 1))
-    assert interactive_agents(segment, 2).tolist() == [0, 4]
-
-
-def test_those_seen_throughout_are_preferred() -> None:
-    segment = hide(abreast([5, 6, 7], [2, 2, 2]), 1, slice(5, 6))
-    assert interactive_agents(segment, 4).tolist() == [0, 2, 3, 1]
 
 
 def test_travel_is_where_an_agent_got_not_how_much_it_shook() -> None:
@@ -303,36 +268,26 @@ def test_the_order_of_agents_does_not_matter(random: Any, count: int, make: Any)
     assert mixed.agent_id[again].tolist() == segment.agent_id[chosen].tolist()
 
 
-def excluded(segment: RunSegment, count: int) -> tuple[str, str | None, str]:
-    """Kind, field and message of what excludes a segment."""
-    found = exclusion(segment, count)
-    if found is None:
-        return "", "", ""
-    kind, error = found
-    assert (error.segment, error.file) == (segment.segment_id, segment.file or None)
-    return kind, error.field, error.message
+def test_too_few_crowds_and_large_maps_are_left_out() -> None:
+    def excluded(segment: RunSegment, count: int) -> str:
+        kind, error = exclusion(segment, count) or ("", None)
+        assert error is None or (error.segment, error.file) == (segment.segment_id, "log.xml")
+        return kind
 
-
-def test_too_few_are_refused() -> None:
-    segment = abreast([5, 6, 7], [2, 2, 0], file="log.xml")
-    message = "needs 4 interactive agents at its first step, has 3"
-    assert excluded(segment, 4) == ("interactive_agents", "agents", message)
-    with pytest.raises(DataError, match="has no ego"):
-        interactive_agents(hide(segment, 0, slice(0, 1)), 2)
-
-
-def test_crowds_are_refused() -> None:
-    segment = abreast([5.0 + k for k in range(258)], [2.0] * 258)
-    message = "257 playback agents, at most 256 allowed"
-    assert excluded(segment, 2) == ("playback_agents", "agents", message)
-    assert excluded(segment, 3) == excluded(hide(segment, 100, slice(None)), 2) == ("", "", "")  # never seen
-
-
-def test_large_maps_are_refused_by_length_not_by_density() -> None:
     def with_lane(length: float, spacing: float) -> RunSegment:
         x = np.linspace(0, length, round(length / spacing) + 1)
-        return abreast([5], [2]).replace(road=make_road([np.stack([x, 0 * x], -1)]))
+        return abreast([5], [2], file="log.xml").replace(road=make_road([np.stack([x, 0 * x], -1)]))
 
+    few = abreast([5, 6, 7], [2, 2, 0], file="log.xml")
+    assert (excluded(few, 4), excluded(few, 3)) == ("interactive_agents", "")
+    with pytest.raises(DataError, match="has no ego"):
+        interactive_agents(hide(few, 0, slice(0, 1)), 2)
+    crowd = abreast([5.0 + k for k in range(258)], [2.0] * 258, file="log.xml")
+    unseen = hide(crowd, 100, slice(None))
+    assert [excluded(crowd, 2), excluded(crowd, 3), excluded(unseen, 2)] == ["playback_agents", "", ""]
+    # By its length, not by how densely it is drawn.
     assert road_points(with_lane(100, 0.1)) == road_points(with_lane(100, 50)) == 51
-    assert excluded(with_lane(19_990, 0.5), 2) == ("", "", "")
-    assert excluded(with_lane(20_010, 50), 2)[:2] == ("roadgraph_points", "road")
+    assert (excluded(with_lane(19_990, 0.5), 2), excluded(with_lane(20_010, 50), 2)) == (
+        "",
+        "roadgraph_points",
+    )

@@ -17,8 +17,8 @@ from symphony.data.generate import Plan, generate
 from symphony.data.segment import RoadMap, RunSegment, SignalState, content_hash
 from symphony.data.selection import MOVING, exclusion, interactive_agents, travel
 from symphony.data.sources import sumo
-from symphony.data.sources.sumo import extract, process
-from symphony.data.sources.sumo.networks import kind_name, own_network, town
+from symphony.data.sources.sumo import process
+from symphony.data.sources.sumo.networks import own_network, town
 from symphony.data.sources.sumo.roads import read_network
 from symphony.data.store import SegmentStore
 from symphony.envs.routes import route_table
@@ -164,27 +164,6 @@ def test_segments_of_one_focus_share_map_and_origin(simulated: dict[str, list[Ru
         assert len({id(segment.road) for segment in run}) == len(by_focus)
 
 
-@needs_sumo
-def test_windows_beyond_a_limit_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(extract, "MAX_OVERLAP", -9.0)
-    run = sumo.generate_run("town", 3, 45.0, rule=RULE)
-    assert run.reasons["overlap"] > 0
-
-
-@needs_sumo
-def test_failure_of_a_program_shows_its_message(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"netconvert failed(.|\n)*absent\.xml"):
-        process.run_program("netconvert", "--node-files absent.xml", tmp_path)
-
-
-def test_missing_sumo_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    process.sumo_home.cache_clear()
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(DataError, match=r"symphony-traffic\[sumo\]"):
-        sumo.generate_run("town", 0)
-    process.sumo_home.cache_clear()
-
-
 # Roads of one's own
 
 
@@ -247,11 +226,6 @@ def test_what_is_no_map_is_an_error_that_names_it(tmp_path: Path, text: str) -> 
         own_network(file, tmp_path)
     with pytest.raises(ConfigError, match="there is no file"):
         Plan(1, kinds=("nowhere.xodr",))
-
-
-def test_names_of_files_can_stand_in_names_of_segments() -> None:
-    assert kind_name("/a b/Straße 1.net.xml") == "Stra_e_1"
-    assert kind_name("town") == "town"
 
 
 # The built-in set

@@ -137,15 +137,6 @@ def test_lanes_without_points_and_edges_of_one_go_with_all_that_refers_to_them(p
     assert len(road.boundary) == len(segment.signal_lane) == 0
 
 
-@pytest.mark.parametrize("rate", [10, 15, 30, 60])
-def test_the_time_step_is_that_of_the_whole_log(path: Path, rate: int) -> None:
-    """Rounded to milliseconds, steps of 1/30 s would take a hundredth off the time."""
-    scenario = womd_scenario(steps=91)
-    jitter = np.random.default_rng(0).uniform(-2e-5, 2e-5, 91)
-    scenario.timestamps_seconds[:] = (np.arange(91) / rate + jitter).tolist()
-    assert convert(path, scenario).dt == (0.1 if rate == 10 else pytest.approx(1 / rate, rel=1e-4))
-
-
 @pytest.mark.parametrize(
     ("change", "field"),
     [
@@ -207,14 +198,6 @@ def test_single_odd_things_are_left_out(path: Path, change: Change, kind: str) -
     assert whole.num_agents - found.num_agents == (kind == NO_SIZE)
     if kind == WILD:
         assert np.argwhere(~found.valid).tolist() == [[0, 2]]
-
-
-def test_a_name_that_is_no_text_is_refused(path: Path) -> None:
-    payload = womd_scenario("abcdefgh").SerializeToString().replace(b"abcdefgh", b"abc\xb3efgh")
-    write_records(path, [payload])
-    error = read_error("womd", path)
-    assert error.segment is None
-    assert str(error.field).startswith("record 0")
 
 
 # Files of records

@@ -27,7 +27,7 @@ from symphony.errors import ConfigError, SymphonyError
 from symphony.evaluation import Evaluation, evaluate
 from symphony.learning.demonstrations import SceneDataset
 from symphony.rollouts.unroll import NotFiniteError
-from symphony.rollouts.workers import batches, naming, segments_together, shared
+from symphony.rollouts.workers import batches, naming, shared
 from symphony.saved.folder import About, RolloutWriter
 from symphony.saved.rollouts import SavedRollouts
 from test_engine import gone
@@ -105,26 +105,6 @@ def test_batches_are_all_items_in_order_whoever_gets_them(items: int, batch: int
         assert all(len(part) == batch for part in found[:-1])
     elif workers > 1 and items >= 2 * workers:
         assert len(found) > workers  # nobody is left without one
-
-
-@pytest.mark.parametrize(
-    ("settings", "together"),
-    [
-        ({}, 64),
-        ({"batch": 3}, 3),
-        ({"rollouts": 1024, "branches": 1024}, 21),
-        ({"rollouts": 4, "trees": 2, "branches": 512}, 21),
-        ({"branches": 512, "interactive": "all"}, 2),
-        ({"rollouts": 10**4, "branches": 10**4, "interactive": "all"}, 1),
-    ],
-)
-def test_as_many_segments_together_as_see_a_bounded_number_of_points(
-    settings: dict[str, Any], together: int
-) -> None:
-    agent = make_agent()
-    assert agent.observation.num_points == 12  # 2 agents x 1 024 branches x 12 points x 21 are 2^19
-    config = EvaluateConfig(**{"search": "tree", "branches": 16} | settings)
-    assert segments_together(agent, config, 2) == together
 
 
 def spoiled() -> Any:
