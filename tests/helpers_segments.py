@@ -10,16 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from symphony.data import segment as schema
-from symphony.data.segment import (
-    STATES,
-    AgentType,
-    LaneType,
-    MarkType,
-    Polylines,
-    RoadMap,
-    RunSegment,
-    validate,
-)
+from symphony.data.segment import AgentType, LaneType, MarkType, Polylines, RoadMap, RunSegment, validate
 
 LANE_WIDTH = 3.5
 CAR = (4.6, 1.9, 1.6)
@@ -89,7 +80,7 @@ def make_segment(
 
 def hide(segment: RunSegment, agent: int, steps: slice) -> RunSegment:
     """The segment with one agent not seen during some steps."""
-    fields = {name: getattr(segment, name).copy() for name in STATES}
+    fields = {name: getattr(segment, name).copy() for name in schema.STATES}
     for array in fields.values():
         array[agent, steps] = 0
     return segment.replace(**fields)

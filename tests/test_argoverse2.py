@@ -47,13 +47,8 @@ def test_tracks(tmp_path: Path) -> None:
     whole = scenario()
     columns = {name: values[: whole["observed"].index(False)] for name, values in whole.items()}
     put("object_type", "tram")(columns)
-    segment = read_one(
-        "argoverse2",
-        write(
-            tmp_path,
-            columns | {"track_id": ["AV"] * 8, "object_category": [3] * 8, "focal_track_id": ["AV"] * 8},
-        ),
-    )
+    columns |= dict.fromkeys(("track_id", "focal_track_id"), ["AV"] * 8)
+    segment = read_one("argoverse2", write(tmp_path, columns))
     assert (segment.num_steps, segment.current_step, segment.dt) == (8, 7, 0.1)
     assert (segment.odd, segment.agent_type.tolist()) == ({NO_TYPE: "'tram'"}, [AgentType.OTHER])
 

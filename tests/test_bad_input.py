@@ -9,17 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from helpers_sources import (
-    RECTANGLE,
-    ROAD,
-    commonroad,
-    driver,
-    obstacle,
-    read_error,
-    read_one,
-    state,
-    womd_scenario,
-)
+from helpers_sources import RECTANGLE, ROAD, commonroad, driver, read_error, read_one, womd_scenario
 from symphony.data.convert import convert
 from symphony.data.segment import RunSegment, content_hash, validate
 from symphony.data.sources import get_reader, readers
@@ -134,15 +124,11 @@ def test_commonroad_document_types_are_refused(attack: str, encoding: str, tmp_p
     assert (error.field, error.file) == ("DOCTYPE", path)
 
 
-LANELESS = commonroad(driver(7))
-NO_DRIVERS = commonroad(ROAD, obstacle(7, [state(0, 0, 0)], role="static"))
-
-
 @pytest.mark.parametrize(
     ("text", "field", "message"),
     [
-        (LANELESS, "lanelet", "has no lanes"),
-        (NO_DRIVERS, "dynamicObstacle", "has no dynamic obstacles"),
+        (commonroad(driver(7)), "lanelet", "has no lanes"),
+        (commonroad(ROAD), "dynamicObstacle", "has no dynamic obstacles"),
         (commonroad(ROAD, driver(7, speed=0)), "dynamicObstacle", "no moving vehicle"),
         (GOOD.replace("2020a", "2017a"), "commonRoadVersion", "2018b or 2020a"),
         (GOOD.replace('timeStepSize="0.1"', ""), "timeStepSize", "not a number"),

@@ -10,18 +10,8 @@ import shapely
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from helpers_sources import (
-    RECTANGLE,
-    ROAD,
-    bound,
-    commonroad,
-    driver,
-    lanelet,
-    obstacle,
-    off_road,
-    signed_area,
-    state,
-)
+from helpers_sources import RECTANGLE, ROAD, bound, driver, lanelet, obstacle, off_road, signed_area, state
+from helpers_sources import commonroad as file_of
 from helpers_sources import convert_xml as convert
 from symphony.data.segment import MarkType, RunSegment, SignalState, content_hash
 from symphony.data.sources import get_reader
@@ -114,7 +104,7 @@ def test_the_ego_has_the_most_moving_neighbours(path: Path) -> None:
     assert convert(path, ROAD, *cars).ego == 1
     assert convert(path, ROAD, *cars[:3], *cars[4:]).ego == 2
     for order in (cars, cars[::-1]):
-        path.write_text(commonroad(ROAD, *order))
+        path.write_text(file_of(ROAD, *order))
         items = list(get_reader("commonroad", egos="all").read(path))
         names = [item.segment_id for item in items if isinstance(item, RunSegment)]
         assert names == [f"ZAM_Made-1_1_T-1_ego{ego}" for ego in (5, 6, 8, 9)]

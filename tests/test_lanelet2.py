@@ -14,25 +14,14 @@ from hypothesis import strategies as st
 from helpers_interaction import BORDER, DASHED, LANELETS, ORIGIN, PARKING, ROAD, WAYS, osm, with_area
 from helpers_sources import off_road
 from symphony.data.segment import LaneType, MarkType, RoadMap
-from symphony.data.sources.lanelet2 import (
-    NO_AREA,
-    NO_LANELET,
-    NO_NODE,
-    LaneletMap,
-    lane_lanelets,
-    mercator,
-    middle,
-    read_lanelet2,
-    road_map,
-    stop_line,
-    utm,
-)
+from symphony.data.sources import lanelet2
+from symphony.data.sources.lanelet2 import mercator, middle, read_lanelet2, road_map, stop_line, utm
 from symphony.errors import DataError
 
 FROM_ORIGIN = partial(mercator, origin=np.array(ORIGIN))
 
 
-def read(folder: Path, content: str) -> LaneletMap:
+def read(folder: Path, content: str) -> lanelet2.LaneletMap:
     path = folder / "made.osm"
     path.write_text(content)
     return read_lanelet2(path, FROM_ORIGIN)
@@ -67,7 +56,7 @@ def test_marks(tmp_path: Path) -> None:
     np.testing.assert_allclose(road.marks[kinds.index(MarkType.STOP_SIGN)], [[100, 2, 0]])
     ring = road.marks[kinds.index(MarkType.CROSSWALK)]
     np.testing.assert_array_equal(ring[0], ring[-1])
-    lanes = lane_lanelets(source)
+    lanes = lanelet2.lane_lanelets(source)
     np.testing.assert_allclose(stop_line(lanes[0], source.rules), (50, 4))
     assert stop_line(lanes[1], source.rules) is None
     np.testing.assert_array_equal(middle(source), (50, 4))
@@ -170,19 +159,19 @@ def test_broken_maps_are_refused_by_name(content: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "kind", "example"),
     [
-        (osm().replace("<member type='way' ref='21' role='right'/>", "", 1), NO_LANELET, "0 ways"),
-        (osm(ways=WAYS | {21: ((1, 77), BORDER)}), NO_NODE, "node 77"),
-        (osm(ways=WAYS | {21: ((1,), BORDER)}), NO_LANELET, "two points"),
-        (with_area(PARKING, members="61o 62o"), NO_AREA, "is not closed"),
-        (with_area(PARKING, members="61o 62o 63o 64o 65o"), NO_AREA, "2 outlines"),
-        (with_area(PARKING, members="61o 99o"), NO_AREA, "there is no way 99"),
+        (osm().replace("<member type='way' ref='21' role='right'/>", "", 1), lanelet2.NO_LANELET, "0 ways"),
+        (osm(ways=WAYS | {21: ((1, 77), BORDER)}), lanelet2.NO_NODE, "node 77"),
+        (osm(ways=WAYS | {21: ((1,), BORDER)}), lanelet2.NO_LANELET, "two points"),
+        (with_area(PARKING, members="61o 62o"), lanelet2.NO_AREA, "is not closed"),
+        (with_area(PARKING, members="61o 62o 63o 64o 65o"), lanelet2.NO_AREA, "2 outlines"),
+        (with_area(PARKING, members="61o 99o"), lanelet2.NO_AREA, "there is no way 99"),
     ],
 )
 def test_what_a_map_lacks_is_left_out(content: str, kind: str, example: str, tmp_path: Path) -> None:
     source = read(tmp_path, content)
     assert example in source.odd[kind]
     left = {lanelet.lanelet_id for lanelet in source.lanelets}
-    assert left == set(LANELETS) - ({101} if kind != NO_AREA else set())
+    assert left == set(LANELETS) - ({101} if kind != lanelet2.NO_AREA else set())
     assert not source.areas
 
 

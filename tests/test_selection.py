@@ -12,16 +12,7 @@ from hypothesis import strategies as st
 from helpers_segments import along, crossing, hide, make_road, make_segment, straight_road, turned
 from symphony.data import selection as contexts
 from symphony.data.segment import AgentType, RunSegment
-from symphony.data.selection import (
-    CONFLICT_GAP,
-    Context,
-    exclusion,
-    interactive_agents,
-    interactive_choice,
-    relations,
-    road_points,
-    travel,
-)
+from symphony.data.selection import Context, exclusion, interactive_agents, interactive_choice, relations
 from symphony.errors import DataError
 
 STEPS, DT = 51, 0.2
@@ -34,13 +25,14 @@ EAST = np.asarray([[-200.0, 0], [200, 0]])
 BESIDE = NORTH + np.asarray([3.5, 0])
 """The next lane to the right of NORTH."""
 ONCOMING = NORTH[::-1] + np.asarray([-3.5, 0])
-TURN_RIGHT_INTO_NORTH = np.concatenate(
+TURN_IN = np.concatenate(
     [[[-100.0, 10]], np.stack([-10 + 10 * np.sin(ARC), 20 - 10 * np.cos(ARC)], -1), [[0, 200]]]
 )
 """From the west into NORTH, which it reaches at y = 20, 100.7 m on."""
-TURN_LEFT_OFF_NORTH = np.concatenate(
+TURN_OFF = np.concatenate(
     [[[0.0, -200]], np.stack([-10 + 10 * np.cos(ARC), -20 + 10 * np.sin(ARC)], -1), [[-200, -10]]]
 )
+CREEP = np.minimum(0.5 * TIME, 4)
 CHANGE_LANE = np.asarray([[3.5, -200], [3.5, -30], [0, 0], [0, 200]])
 
 
@@ -58,60 +50,37 @@ def north(y: float, speed: float = 8.0) -> Any:
     return 200 + y + speed * TIME
 
 
-CASES: dict[str, tuple[Context, Paths]] = {
+BY_CONTEXT: dict[Context, dict[str, Paths]] = {
     # Each has the partner second; what follows is nearer, at first, and has less to do with the ego.
-    "turns in before": (
-        Context.MERGE,
-        [(NORTH, north(-30)), (TURN_RIGHT_INTO_NORTH, 100.7 - 34 + 8 * TIME), (BESIDE, north(-28))],
-    ),
-    "turns in after": (
-        Context.MERGE,
-        [(NORTH, north(-10)), (TURN_RIGHT_INTO_NORTH, 100.7 - 50 + 8 * TIME), (NORTH, north(-25))],
-    ),
-    "changes lane ahead": (
-        Context.MERGE,
-        [(NORTH, north(-60, 10)), (CHANGE_LANE, north(-42, 10)), (NORTH, north(-75, 10))],
-    ),
-    "ego changes lane": (
-        Context.MERGE,
-        [(CHANGE_LANE, north(-42, 10)), (NORTH, north(-60, 10)), (BESIDE, north(-57, 10))],
-    ),
-    "crosses": (
-        Context.CROSSING,
-        [(NORTH, north(-40)), (EAST, 200 - 60 + 8 * TIME), (NORTH, north(-55)), (ONCOMING, 220 + 8 * TIME)],
-    ),
-    "crosses from a stop": (
-        Context.CROSSING,
-        [(NORTH, north(-20)), (EAST, 200 - 9 + np.maximum(TIME - 3, 0) ** 2), (NORTH, north(-35))],
-    ),
-    "leads": (Context.LEADER, [(NORTH, north(-60)), (NORTH, north(-44)), (BESIDE, north(-58))]),
-    "leads and turns off": (
-        Context.LEADER,
-        [(NORTH, north(-60)), (TURN_LEFT_OFF_NORTH, north(-44, 6)), (BESIDE, north(-58))],
-    ),
-    "leads around a corner": (
-        Context.LEADER,
-        [(TURN_LEFT_OFF_NORTH, north(-45)), (TURN_LEFT_OFF_NORTH, north(-25)), (BESIDE, north(-43))],
-    ),
-    "leads in a queue": (
-        Context.LEADER,
-        [
-            (NORTH, north(-20, 0) + np.minimum(0.5 * TIME, 4)),
-            (NORTH, north(-12, 0) + np.minimum(0.5 * TIME, 3)),
-            (BESIDE, north(-19, 0) + 0.5 * TIME),
-        ],
-    ),
-    "follows": (Context.FOLLOWER, [(NORTH, north(-40)), (NORTH, north(-56)), (BESIDE, north(-42))]),
-    "follows closer than the leader leads": (
-        Context.FOLLOWER,
-        [(NORTH, north(-40)), (NORTH, north(-52)), (NORTH, north(-20))],
-    ),
-    "next lane": (Context.NEAREST, [(NORTH, north(-40)), (BESIDE, north(-30)), (NORTH, north(40))]),
-    "head on": (Context.NEAREST, [(NORTH, north(-40)), (NORTH[::-1], 200 + 8 * TIME)]),
-    "oncoming": (Context.NEAREST, [(NORTH, north(-40)), (ONCOMING, 200 + 8 * TIME)]),
-    "crosses long before": (Context.NEAREST, [(NORTH, north(-60)), (EAST, 200 - 8 + 8 * TIME)]),
-    "far ahead": (Context.NEAREST, [(NORTH, north(-60, 8)), (NORTH, north(-20, 8))]),
+    Context.MERGE: {
+        "turns in before": [(NORTH, north(-30)), (TURN_IN, 66.7 + 8 * TIME), (BESIDE, north(-28))],
+        "turns in after": [(NORTH, north(-10)), (TURN_IN, 50.7 + 8 * TIME), (NORTH, north(-25))],
+        "changes lane": [(NORTH, north(-60, 10)), (CHANGE_LANE, north(-42, 10)), (NORTH, north(-75, 10))],
+        "ego changes": [(CHANGE_LANE, north(-42, 10)), (NORTH, north(-60, 10)), (BESIDE, north(-57, 10))],
+    },
+    Context.CROSSING: {
+        "crosses": [(NORTH, north(-40)), (EAST, north(-60)), (NORTH, north(-55)), (ONCOMING, north(20))],
+        "from a stop": [(NORTH, north(-20)), (EAST, 191 + np.maximum(TIME - 3, 0) ** 2), (NORTH, north(-35))],
+    },
+    Context.LEADER: {
+        "leads": [(NORTH, north(-60)), (NORTH, north(-44)), (BESIDE, north(-58))],
+        "leads and turns off": [(NORTH, north(-60)), (TURN_OFF, north(-44, 6)), (BESIDE, north(-58))],
+        "leads around a corner": [(TURN_OFF, north(-45)), (TURN_OFF, north(-25)), (BESIDE, north(-43))],
+        "queue": [(NORTH, 180 + CREEP), (NORTH, 188 + 0.75 * CREEP), (BESIDE, north(-19, 0.5))],
+    },
+    Context.FOLLOWER: {
+        "follows": [(NORTH, north(-40)), (NORTH, north(-56)), (BESIDE, north(-42))],
+        "follows closer than it leads": [(NORTH, north(-40)), (NORTH, north(-52)), (NORTH, north(-20))],
+    },
+    Context.NEAREST: {
+        "next lane": [(NORTH, north(-40)), (BESIDE, north(-30)), (NORTH, north(40))],
+        "head on": [(NORTH, north(-40)), (NORTH[::-1], north(0))],
+        "oncoming": [(NORTH, north(-40)), (ONCOMING, north(0))],
+        "crosses long before": [(NORTH, north(-60)), (EAST, north(-8))],
+        "far ahead": [(NORTH, north(-60)), (NORTH, north(-20))],
+    },
 }
+CASES = {name: (context, paths) for context, found in BY_CONTEXT.items() for name, paths in found.items()}
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -156,7 +125,7 @@ def test_crossing_is_a_matter_of_time(
     # The place is as wide as half a step and half a metre of either: at an acute angle a slow one needs time for it.
     mine = (speed * DT / 2 + 0.5) / np.sin(angle)
     theirs = mine * abs(np.cos(angle)) + other_speed * DT / 2 + 0.5
-    assume(abs(abs(gap) - CONFLICT_GAP) > mine / speed + theirs / other_speed + DT)
+    assume(abs(abs(gap) - contexts.CONFLICT_GAP) > mine / speed + theirs / other_speed + DT)
     # Both pass the place within the window, the first of them after a second.
     arrival, other_arrival = 1 + max(0.0, -gap), 1 + max(0.0, gap)
     heading = np.pi / 2 + (-angle if right else angle)
@@ -164,7 +133,7 @@ def test_crossing_is_a_matter_of_time(
     path = np.stack([-400 * way, 400 * way])
     paths = [(2 * NORTH, 400 + speed * (TIME - arrival)), (path, 400 + other_speed * (TIME - other_arrival))]
     segment = scene(paths)
-    expected = Context.CROSSING if abs(gap) <= CONFLICT_GAP else Context.NEAREST
+    expected = Context.CROSSING if abs(gap) <= contexts.CONFLICT_GAP else Context.NEAREST
     assert interactive_choice(segment, 2).context == expected
     found = relations(segment, np.asarray([1])).crossing[0]
     if expected == Context.CROSSING:
@@ -195,7 +164,7 @@ def test_a_partner_that_is_seen_throughout_goes_first() -> None:
 
 @pytest.mark.parametrize("tile", [60, 5 * STEPS])
 def test_tiles_of_any_size_give_the_same(tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    turns, crosses = (TURN_RIGHT_INTO_NORTH, 12 * TIME + 60), (EAST, 15 * TIME + 120)
+    turns, crosses = (TURN_IN, 12 * TIME + 60), (EAST, 15 * TIME + 120)
     cars = scene([(NORTH, 30 * TIME + 50), turns, crosses, (NORTH, 80)])
     segments = [cars, crossing(6, steps=60, seed=3), straight_road(9, steps=40)]
     whole = [relations(each, np.arange(1, each.num_agents)) for each in segments]
@@ -251,7 +220,7 @@ def test_travel_is_where_an_agent_got_not_how_much_it_shook() -> None:
     shaken = segment.position.copy()
     shaken[1, :, 0] += np.tile([0, 0.9], 3)
     segment = hide(segment.replace(position=shaken), 2, slice(0, 2))
-    np.testing.assert_allclose(travel(segment), [5, 0.9, 6], rtol=1e-5)
+    np.testing.assert_allclose(contexts.travel(segment), [5, 0.9, 6], rtol=1e-5)
 
 
 @settings(max_examples=30, deadline=None)
@@ -286,7 +255,7 @@ def test_too_few_crowds_and_large_maps_are_left_out() -> None:
     unseen = hide(crowd, 100, slice(None))
     assert [excluded(crowd, 2), excluded(crowd, 3), excluded(unseen, 2)] == ["playback_agents", "", ""]
     # By its length, not by how densely it is drawn.
-    assert road_points(with_lane(100, 0.1)) == road_points(with_lane(100, 50)) == 51
+    assert contexts.road_points(with_lane(100, 0.1)) == contexts.road_points(with_lane(100, 50)) == 51
     assert (excluded(with_lane(19_990, 0.5), 2), excluded(with_lane(20_010, 50), 2)) == (
         "",
         "roadgraph_points",

@@ -28,9 +28,7 @@ ROWS = 8
 
 def main(args: list[str] | None = None) -> int:
     """Measure and report; status 1 if memory grew by a tenth, or files by one, in the second half."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--updates", type=int, default=2000)
     parser.add_argument("--segments", type=int, default=2000, help="to evaluate")
     parser.add_argument("--method", choices=METHODS, default="bc")

@@ -135,9 +135,7 @@ def _work(name: str, numbers: range, seed: int, pipe: int, folder: Path) -> None
 
 def main(args: list[str] | None = None) -> int:
     """Run and report; status 1 if any input was not read as it should be."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--inputs", type=int, default=1000, help="per target, those of earlier runs included")
     parser.add_argument("--targets", nargs="+", choices=list(TARGETS), default=list(TARGETS))
     parser.add_argument("--seed", type=int, default=0)

@@ -51,10 +51,8 @@ from symphony.wosac import wosac_pb2 as pb
 from symphony.wosac.meta import SubmissionMeta
 from symphony.wosac.submission import check_submission, required_agents, write_submission
 
-USED, REPORTED = (
-    12,
-    4,
-)  # one in so many good segments is used, and saved rollouts reported: it takes far longer
+USED, REPORTED = 12, 4
+"""One in so many good segments is used, and saved rollouts reported: it takes far longer."""
 SHORT = range(30)  # steps of the recordings that are changed
 NAMES = ("aaaa", "bbbb")
 BOMB = 32 << 20  # bytes of zeros in a member of an archive, at times
@@ -339,16 +337,10 @@ def _read_configuration(folder: Path, _: str) -> tuple[str, str]:
 
 
 def _submission(folder: Path) -> Path:
-    no = dict.fromkeys(("uses_lidar_data", "uses_camera_data", "uses_public_model_pretraining"), False)
-    meta = SubmissionMeta(
-        account_name="somebody@example.org",
-        unique_method_name="made",
-        **no,
-        num_model_parameters="200K",
-        acknowledge_complies_with_closed_loop_requirement=True,
-        authors=("A",),
-        affiliation="Nowhere",
-    )
+    facts: dict[str, Any] = {"account_name": "a@example.org", "unique_method_name": "made", "authors": ("A",)}
+    facts |= dict.fromkeys(("uses_lidar_data", "uses_camera_data", "uses_public_model_pretraining"), False)
+    facts |= {"num_model_parameters": "200K", "affiliation": "Nowhere"}
+    meta = SubmissionMeta(**facts, acknowledge_complies_with_closed_loop_requirement=True)
     scenarios = [womd_record(name, tracks=2 - k) for k, name in enumerate(NAMES)]
     write_records(folder / "a.tfrecord", [each.SerializeToString() for each in scenarios])
     rollouts = [(each.scenario_id, record_rollouts(each)) for each in scenarios]

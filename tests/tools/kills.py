@@ -118,9 +118,7 @@ def spent(group: int) -> float:
 
 def main(args: list[str] | None = None) -> int:
     """Run and report; status 1 if anything was lost, came twice, or differs."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=30, help="of each target")
     parser.add_argument("--targets", nargs="+", metavar="NAME", help="beginnings of names; all by default")
     parser.add_argument("--seed", type=int, default=0)

@@ -146,34 +146,27 @@ def tests(files: Sequence[str]) -> int:
 
 def main(args: list[str] | None = None) -> int:
     """Make changes in turns over the modules; status 1 if one was not noticed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--changes", type=int, default=10, help="of each module")
     parser.add_argument("--modules", nargs="+", default=ROOMS, help="such as envs, or envs.flags")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--again", type=Path, help="earlier counts: only the changes that were not noticed")
     parser.add_argument("--out", type=Path, default=Path("out/mutate.json"), help="where the counts are kept")
     given = parser.parse_args(args)
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    found: dict[str, dict[str, Any]] = {} if given.again is None else json.loads(given.again.read_text())
-    for name in list(found) or modules(given.modules):
+    found: dict[str, dict[str, Any]] = {}
+    for name in modules(given.modules):
         module, files = importlib.import_module(f"symphony.{name}"), tests_of(name)
         if noticed(module, None, files):
             raise SystemExit(f"{' '.join(files)}: fails as it is")
         tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
         possible = [f"line {line}: {what}" for what, line, _ in changes(tree)]
-        if name in found:
-            chosen = [k for k, text in enumerate(possible) if text in found[name]["missed"]]
-        else:
-            number = min(given.changes, len(possible))
-            chosen = random.Random(given.seed).sample(range(len(possible)), number)
-            found[name] = {"possible": len(possible), "made": number}
+        number = min(given.changes, len(possible))
+        chosen = random.Random(given.seed).sample(range(len(possible)), number)
         missed = [possible[k] for k in sorted(chosen) if not noticed(module, k, files)]
         for text in missed:
             print(f"not noticed: {name}, {text}", flush=True)
         print(f"{name}: {len(chosen)} of {len(possible)} changes made", flush=True)
-        found[name]["missed"] = missed
+        found[name] = {"possible": len(possible), "made": number, "missed": missed}
         given.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     made = sum(each["made"] for each in found.values())
     lost = sum(len(each["missed"]) for each in found.values())
