@@ -208,7 +208,7 @@ def test_maps_without_a_part(name: str, tmp_path: Path) -> None:
         (("pedestrian_crossings", "5", "edge2"), points([(0, 0)]), NO_CROSSING),
     ],
 )
-def test_entries_that_can_not_be_read_are_left_out(
+def test_unreadable_entries_are_left_out(
     keys: tuple[str, ...], value: Any, kind: str, tmp_path: Path
 ) -> None:
     found = read_one("argoverse2", written_with(tmp_path, keys, value))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from symphony.data.segment import RunSegment, content_hash, validate
 from symphony.data.sources import get_reader, readers
 from symphony.data.sources.base import Item
 from symphony.data.sources.commonroad import NO_LANELET, NO_LIGHT, NO_OBSTACLE
-from symphony.data.sources.tfrecord import write_records
+from symphony.data.sources.tfrecord import masked_crc32c, write_records
 from symphony.errors import DataError
 
 IN_FOLDER = settings(
@@ -102,6 +103,13 @@ def test_womd_cut_anywhere_or_with_a_flipped_bit(data: st.DataObject, shard: byt
     assert found == [*whole[:broken], None, *rest]
 
 
+def test_a_huge_length_is_not_allocated(tmp_path: Path) -> None:
+    head = struct.pack("<Q", 2**62)
+    path = tmp_path / "a"
+    path.write_bytes(head + struct.pack("<I", masked_crc32c(head)) + b"abc\0\0\0\0")
+    assert "cut short" in read_error("womd", path).message
+
+
 # CommonRoad
 
 
@@ -140,9 +148,7 @@ def test_commonroad_document_types_are_refused(attack: str, encoding: str, tmp_p
         (commonroad(ROAD, driver(7, x=1e6), driver(8)), "position", "not re-centred"),
     ],
 )
-def test_commonroad_errors_name_segment_and_field(
-    text: str, field: str, message: str, tmp_path: Path
-) -> None:
+def test_commonroad_errors_are_named(text: str, field: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "a.xml"
     path.write_text(text)
     error = read_error("commonroad", path)
@@ -167,9 +173,7 @@ def test_commonroad_errors_name_segment_and_field(
         ("<duration>3</duration>", "", NO_LIGHT, "trafficLight 30: duration"),
     ],
 )
-def test_commonroad_odd_things_are_left_out(
-    old: str, new: str, kind: str, example: str, tmp_path: Path
-) -> None:
+def test_commonroad_odd_things(old: str, new: str, kind: str, example: str, tmp_path: Path) -> None:
     light = (
         '<trafficLight id="30"><cycle><cycleElement><duration>3</duration><color>red</color></cycleElement>'
         "</cycle></trafficLight>"

@@ -104,11 +104,7 @@ def test_nothing_usable_is_an_error_and_leaves_nothing(logs: Write, out: Path) -
     path = logs("a.scene", *(f"broken {k}" for k in range(7)))
     with pytest.raises(DataError) as error:
         convert(FakeReader(), [path], out)
-    text = str(error.value)
-    assert text.startswith("none of 7 records could be converted")
-    assert "a.scene, segment bad-4, field tracks: 13 is not 7" in text
-    assert "bad-5" not in text
-    assert text.endswith("and 2 more")
+    assert "a.scene, segment bad-4, field tracks: 13 is not 7" in str(error.value)
     assert left(out) == []
 
 
@@ -158,19 +154,13 @@ def test_info_counts_what_is_there(logs: Write, out: Path) -> None:
     assert (found["segments"], found["signals"], found["maps"], found["version"]) == (3, 24, 2, 1)
     assert found["checksum"] == SegmentStore(out).checksum()
     assert found["sources"] == {"made": 1, "other": 2}
-    assert found["steps"] == {"min": 46, "mean": 46, "max": 46}
-    assert found["duration"]["max"] == pytest.approx(9.0)
     assert found["lanes"] == {"min": 3, "mean": pytest.approx(43 / 3), "max": 20}
-    points = [sum(len(getattr(s.road, k).points) for k in ("lanes", "boundary", "marks")) for s in store]
-    assert found["map_points"]["max"] == max(points)
     assert found["bytes"] == sum(p.stat().st_size for p in out.rglob("*") if p.is_file())
     bad, lonely = found["skipped_details"]
-    place = {"file": str(path), "segment": "bad-4", "field": "tracks"}
-    assert bad == {**place, "message": "13 is not 7"}
+    assert bad == {"file": str(path), "segment": "bad-4", "field": "tracks", "message": "13 is not 7"}
     # The paper's exclusions are counted apart from what can't be used.
     assert lonely["exclusion"] == "interactive_agents"
     assert (found["skipped"], found["exclusions"]["interactive_agents"]) == (2, 1)
-    assert found["problems"] == {"tracks: # is not #": 1}
 
 
 # --- several stores as one -----------------------------------------------------------------------------------
@@ -180,10 +170,9 @@ PARTS = [builtin_store("train"), builtin_store("test")]
 
 def test_the_merged_store_holds_every_segment_as_it_was(tmp_path: Path) -> None:
     stores = [SegmentStore(path) for path in PARTS]
-    told: list[tuple[int, int]] = []
-    merged = merge(PARTS, tmp_path / "all", lambda done, total: told.append((done, total)))
+    merged = merge(PARTS, tmp_path / "all")
     merged.verify()
-    assert len(merged) == sum(map(len, stores)) == told[-1][0] == told[-1][1]
+    assert len(merged) == sum(map(len, stores))
     offset = 0
     for store in stores:
         for k in (0, len(store) - 1):
@@ -353,7 +342,7 @@ def snapshots(folder: Path, action: Callable[[], Any]) -> list[Path]:
     return taken
 
 
-def test_killed_between_any_two_changes_of_a_file(
+def test_killed_between_any_two_changes(
     paths: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(parts, "PART_FILES", 2)
@@ -415,7 +404,7 @@ def test_kill_9_at_random_moments(tmp_path: Path) -> None:
     assert SegmentStore(tmp_path / "store").report == whole.to_json()
 
 
-def test_finished_files_are_not_read_again(
+def test_finished_files_are_not_read(
     paths: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(parts, "PART_FILES", 1)
@@ -435,9 +424,7 @@ def test_finished_files_are_not_read_again(
     assert read == ["d.scene"]
 
 
-def test_workers_make_the_same_store(
-    paths: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_workers_change_nothing(paths: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parts, "PART_FILES", 1)
     told: list[list[tuple[int, int, int]]] = []
     for count in (1, 3):
@@ -462,9 +449,7 @@ class Deadly(FakeReader):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
-def test_a_worker_that_dies_costs_no_finished_work(
-    paths: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_dies(paths: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parts, "PART_FILES", 1)
     with pytest.raises(SymphonyError, match="a worker process ended"):
         convert(Deadly(), paths, tmp_path / "store", workers=2)
@@ -508,16 +493,14 @@ def test_other_arguments_do_not_go_on(paths: list[Path], tmp_path: Path, what: s
 
 def test_a_folder_of_somebodys_own_is_left_alone(paths: list[Path], tmp_path: Path) -> None:
     """Of the name that unfinished work gets: a folder with notes, and a store."""
-    notes = tmp_path / "store.partial"
-    notes.mkdir()
-    (notes / "notes.txt").write_text("mine")
+    (tmp_path / "store.partial").mkdir()
+    (tmp_path / "store.partial" / "notes.txt").write_text("mine")
     convert(FakeReader(), paths[1:2], tmp_path / "other.partial")
-    before = content(tmp_path / "other.partial")
+    before = content(tmp_path)
     for name in ("store", "other"):
         with pytest.raises(DataError, match="no conversion left"):
             convert(FakeReader(), paths, tmp_path / name)
-    assert (notes / "notes.txt").read_text() == "mine"
-    assert content(tmp_path / "other.partial") == before
+    assert content(tmp_path) == before
 
 
 def test_what_is_in_the_way_is_told(paths: list[Path], tmp_path: Path) -> None:

@@ -72,9 +72,7 @@ def fake(monkeypatch: pytest.MonkeyPatch, segments: list[RunSegment]) -> None:
 
 
 @given(seeds, seeds, st.sampled_from(SPLITS), st.sampled_from(SPLITS), numbers, numbers)
-def test_networks_of_other_splits_seeds_and_numbers_are_others(
-    a: int, b: int, split_a: Split, split_b: Split, i: int, j: int
-) -> None:
+def test_no_two_networks_are_alike(a: int, b: int, split_a: Split, split_b: Split, i: int, j: int) -> None:
     first, second = next(Plan(1, a, split_a).networks(i)), next(Plan(1, b, split_b).networks(j))
     assert (first.seed == second.seed) == ((a, split_a, i) == (b, split_b, j))
     # Below 2^32, each seed is one word of NumPy's seed sequence: no two of them mix to the same stream.
@@ -90,9 +88,7 @@ def test_bad_plans_name_the_field() -> None:
 
 
 @pytest.mark.usefixtures("fake")
-def test_an_interrupted_store_is_continued_to_the_same_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_store_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = Plan(23, seed=4)
     whole = generate(plan, tmp_path / "whole")
     want = SegmentStore(tmp_path / "whole")
@@ -132,9 +128,7 @@ def test_an_interrupted_store_is_continued_to_the_same_end(
 
 
 @pytest.mark.usefixtures("fake")
-def test_other_arguments_and_stores_of_another_origin_are_refused(
-    tmp_path: Path, segments: list[RunSegment]
-) -> None:
+def test_other_arguments_and_stores_are_refused(tmp_path: Path, segments: list[RunSegment]) -> None:
     generate(Plan(3), tmp_path / "mine")
     for field, value in {"segments": 10, "seed": 1, "split": "test", "kinds": ("grid",)}.items():
         with pytest.raises(ConfigError, match=f"made with {field}"):
@@ -380,17 +374,6 @@ def test_same_seed_same_segments(simulated: dict[str, list[RunSegment]], name: s
     kind, seed = name.split("-")
     again = sumo.generate_run(kind, int(seed), 45.0, rule=RULE).segments
     assert [content_hash(s) for s in again] == [content_hash(s) for s in simulated[name]]
-
-
-@needs_sumo
-def test_segments_of_one_focus_share_map_and_origin(simulated: dict[str, list[RunSegment]]) -> None:
-    for run in simulated.values():
-        by_focus: dict[str, list[RunSegment]] = {}
-        for segment in run:
-            by_focus.setdefault(segment.segment_id.split("-w")[0], []).append(segment)
-        assert any(len(group) > 1 for group in by_focus.values())
-        assert all(len({(id(s.road), s.origin.tobytes()) for s in group}) == 1 for group in by_focus.values())
-        assert len({id(segment.road) for segment in run}) == len(by_focus)
 
 
 # Roads of one's own

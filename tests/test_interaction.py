@@ -186,7 +186,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("content", "message"), BROKEN)
-def test_broken_tracks_are_refused_by_name(content: str, message: str, tmp_path: Path) -> None:
+def test_broken_tracks_are_refused(content: str, message: str, tmp_path: Path) -> None:
     path = public(tmp_path)
     path.write_text(content, encoding="utf-8")
     error = read_error("interaction", path)
@@ -215,9 +215,7 @@ COMPANIONS = [
 
 
 @pytest.mark.parametrize(("name", "content", "message"), COMPANIONS)
-def test_broken_companions_are_refused_by_name(
-    name: str, content: str | None, message: str, tmp_path: Path
-) -> None:
+def test_broken_companions_are_refused(name: str, content: str | None, message: str, tmp_path: Path) -> None:
     path = taf(tmp_path)
     companion = (path.parent / name).resolve()
     if content is None:

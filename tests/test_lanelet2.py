@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from helpers_interaction import BORDER, DASHED, LANELETS, ORIGIN, PARKING, ROAD, WAYS, osm, with_area
@@ -18,6 +18,7 @@ from symphony.data.sources import lanelet2
 from symphony.data.sources.lanelet2 import mercator, middle, read_lanelet2, road_map, stop_line, utm
 from symphony.errors import DataError
 
+IN_FOLDER = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 FROM_ORIGIN = partial(mercator, origin=np.array(ORIGIN))
 
 
@@ -69,18 +70,15 @@ def test_the_boundary_is_open_at_both_ends(tmp_path: Path) -> None:
     assert len(road.boundary) == 2
 
 
-@settings(max_examples=25)
+@settings(IN_FOLDER, max_examples=25)
 @given(st.lists(st.booleans(), min_size=len(WAYS), max_size=len(WAYS)), st.booleans())
-def test_the_direction_ways_are_drawn_in_does_not_matter(
-    tmp_path_factory: pytest.TempPathFactory, turned: list[bool], swapped: bool
-) -> None:
+def test_the_direction_of_ways_does_not_matter(tmp_path: Path, turned: list[bool], swapped: bool) -> None:
     ways = {
         name: (tuple(nodes)[::-1] if turn else tuple(nodes), tags)
         for (name, (nodes, tags)), turn in zip(WAYS.items(), turned, strict=True)
     }
     lanelets = dict(reversed(LANELETS.items())) if swapped else LANELETS
-    folder = tmp_path_factory.getbasetemp()
-    road, same = road_of(folder, osm(ways=ways, lanelets=lanelets)), road_of(folder, osm())
+    road, same = road_of(tmp_path, osm(ways=ways, lanelets=lanelets)), road_of(tmp_path, osm())
     links = [
         {tuple(pair) for pair in road.lane_id[e].tolist()} for e in (road.successors, road.left_neighbors)
     ]
@@ -120,15 +118,12 @@ def test_speed_limits(tmp_path: Path) -> None:
         np.testing.assert_allclose(road_of(tmp_path, content).speed_limit[0], expected, 1e-6)
 
 
-@settings(max_examples=20)
+@settings(IN_FOLDER, max_examples=20)
 @given(turned=st.tuples(*[st.booleans()] * 5), first=st.integers(0, 2))
-def test_areas_belong_to_the_road_but_for_their_holes(
-    tmp_path_factory: pytest.TempPathFactory, turned: tuple[bool, ...], first: int
-) -> None:
+def test_areas_are_road_but_for_their_holes(tmp_path: Path, turned: tuple[bool, ...], first: int) -> None:
     outer = ["61o", "62o", "63o"]
     members = " ".join(outer[first:] + outer[:first] + ["64i", "65i"])
-    folder = tmp_path_factory.getbasetemp()
-    road, plain = road_of(folder, with_area(PARKING, turned, members)), road_of(folder, osm())
+    road, plain = road_of(tmp_path, with_area(PARKING, turned, members)), road_of(tmp_path, osm())
     spots = np.array([(55, 20), (65, 9), (50, 4), (65, 18), (65, 30), (45, 10)])
     assert (off_road(road, spots) < 0).tolist() == [True, True, True, False, False, False]
     assert not (off_road(plain, spots[:2]) < 0).any()

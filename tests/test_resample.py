@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from helpers_convert import FakeReader
 from helpers_segments import crossing, hide, segments, straight_road, turned
-from symphony.data import resample as resampling
 from symphony.data.convert import convert, info
 from symphony.data.odd import LATE_EGO, NO_SIZE, THIN, WILD, from_ego, mended
 from symphony.data.resample import LOST, REPEATED, UNEVEN, evened, hold_lights, resample, smooth
@@ -156,17 +155,6 @@ def test_a_light_seen_between_picked_steps_is_not_lost(every: int) -> None:
         for k in range(found.num_steps):
             known = [x for x in row[max(every * (k - 1) + 1, 0) : every * k + 1] if x]
             assert found.signal_state[light, k] == (known[-1] if known else 0)
-
-
-@pytest.mark.parametrize("block", [1, 700])
-def test_smoothing_in_blocks_gives_the_same(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = hide(crossing(4, steps=91, dt=0.1), 2, slice(20, 31))
-    noise = np.random.default_rng(0).normal(0, 0.2, log.position.shape).astype(np.float32)
-    log = log.replace(position=np.where(log.valid[..., None], log.position + noise, 0).astype(np.float32))
-    whole = smooth(log, 0.5)
-    monkeypatch.setattr(resampling, "BLOCK", block)
-    for name in ("position", "heading", "velocity"):
-        np.testing.assert_allclose(getattr(smooth(log, 0.5), name), getattr(whole, name), atol=1e-4)
 
 
 def test_absurd_steps_are_refused_before_there_is_room_for_them() -> None:

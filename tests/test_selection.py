@@ -215,14 +215,6 @@ def test_marks_of_the_source_come_first() -> None:
     assert interactive_agents(segment.replace(interest=ints(2)), 4).tolist() == [0, 2, 3, 4]
 
 
-def test_travel_is_where_an_agent_got_not_how_much_it_shook() -> None:
-    segment = abreast([5, 6], [0, 2])
-    shaken = segment.position.copy()
-    shaken[1, :, 0] += np.tile([0, 0.9], 3)
-    segment = hide(segment.replace(position=shaken), 2, slice(0, 2))
-    np.testing.assert_allclose(contexts.travel(segment), [5, 0.9, 6], rtol=1e-5)
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.randoms(use_true_random=False), st.integers(1, 8), st.sampled_from([straight_road, crossing]))
 def test_the_order_of_agents_does_not_matter(random: Any, count: int, make: Any) -> None:

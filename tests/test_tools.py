@@ -120,9 +120,7 @@ def careless(out: Path) -> None:
 
 
 @pytest.mark.parametrize(("work", "good"), [(careful, True), (careless, False)])
-def test_what_is_lost_or_comes_twice_is_found(
-    work: Callable[[Path], None], good: bool, tmp_path: Path
-) -> None:
+def test_what_is_lost_or_comes_twice(work: Callable[[Path], None], good: bool, tmp_path: Path) -> None:
     counts = torment(kills.Target(work, files), tmp_path, 6, seed=0)
     assert counts.kills >= 6
     assert counts.finished >= 1

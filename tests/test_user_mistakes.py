@@ -20,7 +20,6 @@ from symphony.agents import load_agent
 from symphony.cli import ALL_FAILED, main
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
-from symphony.errors import DataError
 from symphony.planners.identity import source_of
 from symphony.recipes import train
 from symphony.rollouts.crowd import crowd_dataset
@@ -98,24 +97,6 @@ class Steady:
 class Called(Steady):
     def __call__(self, seen: Any) -> tuple[float, float]:
         return self.plan(seen)
-
-
-def test_a_planner_with_other_parameters_is_another_simulation(store: Path, tmp_path: Path) -> None:
-    agent, config = load_agent("playback"), EvaluateConfig(rollouts=1)
-    data = crowd_dataset(SegmentStore(store), agent, config, [0], default=1, routes=True)
-
-    def drive(gain: float) -> float:
-        folder = save_simulation(tmp_path / "sim", agent, data, config, planner=partial(steady, gain))
-        assert folder.about.drivers["ego"] == f"{__name__}:steady"
-        return float(folder[0].state[0, -1, 0, 3] - folder[0].state[0, 0, 0, 3])
-
-    assert drive(1.0) == drive(1.0) > 0.5
-    with pytest.raises(DataError, match=r"differs in settings\.planner"):
-        drive(2.0)
-    # One that no file defines, as of python -c, or of what is typed in.
-    typed: dict[str, Any] = {"__name__": "__main__"}
-    exec(PLAN.format("0.0, 0.0"), typed)  # noqa: S102
-    assert len(save_simulation(tmp_path / "typed", agent, data, config, planner=typed["plan"])) == 1
 
 
 def middle(gain: float) -> Any:

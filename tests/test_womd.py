@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from helpers_sources import FAR, read_error, read_one, womd_scenario
 from symphony.data.odd import NO_LINE, NO_SIZE, WILD
 from symphony.data.segment import AgentType, LaneType, MarkType, RunSegment
 from symphony.data.sources import get_reader, readers
-from symphony.data.sources.tfrecord import masked_crc32c, read_records, write_records
+from symphony.data.sources.tfrecord import write_records
 from symphony.data.sources.womd_pb2 import Scenario
 from symphony.errors import ConfigError, DataError
 
@@ -198,50 +197,6 @@ def test_single_odd_things_are_left_out(path: Path, change: Change, kind: str) -
     assert whole.num_agents - found.num_agents == (kind == NO_SIZE)
     if kind == WILD:
         assert np.argwhere(~found.valid).tolist() == [[0, 2]]
-
-
-# Files of records
-
-PAYLOADS = [b"first", b"", b"the third one"]
-
-
-def framed(payload: bytes, length: int | None = None) -> bytes:
-    head = struct.pack("<Q", len(payload) if length is None else length)
-    return b"".join(part + struct.pack("<I", masked_crc32c(part)) for part in (head, payload))
-
-
-def drain(path: Path, data: bytes) -> tuple[list[bytes], list[DataError]]:
-    """Good payloads and errors, raised ones included, of a file with such content."""
-    path.write_bytes(data)
-    items: list[bytes | DataError] = []
-    try:
-        items += read_records(path)
-    except DataError as error:
-        items.append(error)
-    good = [item for item in items if isinstance(item, bytes)]
-    return good, [item for item in items if isinstance(item, DataError)]
-
-
-def test_files_are_cut_or_damaged_and_it_is_noticed(path: Path) -> None:
-    write_records(path, PAYLOADS)
-    whole = path.read_bytes()
-    assert whole == b"".join(map(framed, PAYLOADS))
-    ends = np.cumsum([len(framed(payload)) for payload in PAYLOADS]).tolist()
-    for size in range(len(whole)):
-        payloads, errors = drain(path, whole[:size])
-        count = sum(end <= size for end in ends)
-        assert len(errors) == (size not in ends)
-        assert size == 0 or not errors or (errors[0].file, errors[0].field) == (path, f"record {count}")
-    for bit in range(8 * len(whole)):
-        data = bytearray(whole)
-        data[bit // 8] ^= 1 << bit % 8
-        payloads, errors = drain(path, bytes(data))
-        assert len(errors) == 1
-        assert all(payload in PAYLOADS for payload in payloads)
-    # A damaged payload costs its own record alone, and a huge length is not allocated.
-    payloads, (error,) = drain(path, whole.replace(b"first", b"worst"))
-    assert (payloads, error.field) == (PAYLOADS[1:], "record 0")
-    assert "cut short" in str(drain(path, framed(b"abc", 2**62))[1][0])
 
 
 # A real record

@@ -166,11 +166,6 @@ def test_what_cannot_be_sent_is_refused(store: SegmentStore) -> None:
     with pytest.raises(OSError, match="disk") as error, naming(SceneDataset(store, indices=[3, 1]), [1]):
         raise OSError("disk")
     assert error.value.__notes__ == [f"in one of the run segments {store.ids[1]}"]
-    dataset = SceneDataset(store, indices=[*range(3)] * 4)
-    with pytest.raises(OSError, match="disk") as error, naming(dataset, range(12)):
-        raise OSError("disk")
-    assert error.value.__notes__[0].count(store.ids[1]) == 3
-    assert error.value.__notes__[0].endswith(f"{store.ids[1]} and 4 more (batches of 1 tell which)")
 
 
 def of_command(started: Path, arguments: list[str]) -> int:
