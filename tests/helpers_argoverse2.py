@@ -17,9 +17,8 @@ NAME = "0a1b2c3d-0000-1111-2222-333344445555"
 CARS = {"AV": (15.0, 0.0, 10.0), "101": (20.0, 3.6, 8.0), "102": (60.0, 7.2, -9.0)}
 """Track -> start x, y and speed along x of the vehicles."""
 
-needs_pyarrow = pytest.importorskip(
-    "pyarrow", reason="pyarrow is not installed (pip install 'symphony-traffic[argoverse2]')"
-)
+MISSING = "pyarrow is not installed (pip install 'symphony-traffic[argoverse2]')"
+needs_pyarrow = pytest.importorskip("pyarrow", reason=MISSING)
 
 Columns = dict[str, list[Any]]
 
@@ -49,15 +48,9 @@ def scenario(steps: int = 20) -> Columns:
     track(columns, "8", "cyclist", range(steps), (30, -3), 4.0)
     track(columns, "9", "static", range(3, 5), (40, 11), 0.0, category=0)
     track(columns, "AV", "vehicle", range(steps), CARS["AV"], CARS["AV"][2])
-    same = {
-        "scenario_id": NAME,
-        "focal_track_id": "102",
-        "start_timestamp": 3.15986559459579e17,
-        "end_timestamp": 3.15986559459579e17 + 1e8 * (steps - 1),
-        "num_timestamps": steps,
-        "city": "austin",
-        "map_id": 74806,
-    }
+    begin = 3.15986559459579e17
+    same = {"scenario_id": NAME, "focal_track_id": "102", "num_timestamps": steps, "city": "austin"}
+    same |= {"start_timestamp": begin, "end_timestamp": begin + 1e8 * (steps - 1), "map_id": 74806}
     return columns | {name: [value] * len(columns["timestep"]) for name, value in same.items()}
 
 

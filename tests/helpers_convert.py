@@ -35,6 +35,5 @@ class FakeReader(Reader):
 def scene(kind: str, seed: int) -> RunSegment:
     if kind == "crossing":
         return crossing(seed=seed, dt=0.1, steps=91, source="other")
-    return straight_road(
-        1 if kind == "lonely" else 3, seed=seed, dt=0.1, steps=91, segment_id=f"{kind}-{seed}"
-    )
+    cars = 1 if kind == "lonely" else 3
+    return straight_road(cars, seed=seed, dt=0.1, steps=91, segment_id=f"{kind}-{seed}")

@@ -180,14 +180,9 @@ def place(source: int, point: tuple[float, float], sinks: str = "", groups: str 
     return f"<Placemark><name>Lane {source}</name>{line}<ExtendedData>{data}</ExtendedData></Placemark>"
 
 
-KML = (
-    "<kml xmlns='http://www.opengis.net/kml/2.2'><Document>"
-    + place(1, (49, 2), "11, 12", "7, 8")
-    + place(2, (49, 6), "12", "8")
-    + place(11, (101, 2))
-    + place(12, (101, 6))
-    + "</Document></kml>\n"
-)
+PLACEMARKS = place(1, (49, 2), "11, 12", "7, 8") + place(2, (49, 6), "12", "8")
+PLACEMARKS += place(11, (101, 2)) + place(12, (101, 6))
+KML = f"<kml xmlns='http://www.opengis.net/kml/2.2'><Document>{PLACEMARKS}</Document></kml>\n"
 STATES = {7: ("STOP_AND_REMAIN", "PERMISSIVE_MOVEMENT_ALLOWED"), 8: ("DARK", "PRE_MOVEMENT")}
 PHASES = "signal_group_id,timestamp_ms,movement_state\n" + "".join(
     f"{group},{time},{states[time >= 2000]}\n"

@@ -38,12 +38,9 @@ def track(
     position[:, 0] = x + speed * 0.1 * np.arange(STEPS)
     position[:, 1], position[:, 2] = y, 0.9
     position[:, :2] += FAR
-    state = {
-        "position": np.where(valid[:, None], position, 0.0),
-        "heading": np.zeros(STEPS),
-        "velocity": np.where(valid[:, None], (speed, 0.0), 0.0),
-        "valid": valid.astype(float),
-    }
+    state = {"heading": np.zeros(STEPS), "valid": valid.astype(float)}
+    state["position"] = np.where(valid[:, None], position, 0.0)
+    state["velocity"] = np.where(valid[:, None], (speed, 0.0), 0.0)
     for name, side in zip(("length", "width", "height"), size, strict=True):
         state[name] = np.where(valid, side, 0.0)[:, None]
     return {"type": kind, "state": state, "metadata": {"track_length": STEPS, "type": kind.lower()}}
@@ -55,10 +52,8 @@ def scenario() -> dict[str, Any]:
     The recording vehicle drives in the right lane; a cone, a walker and a late car are there too.
     """
     lane, white = {"type": "LANE_SURFACE_STREET"}, {"type": "ROAD_LINE_SOLID_SINGLE_WHITE"}
-    outline, island = (
-        ((0, -2), (0, 6), (80, 6), (80, -2), (0, -2)),
-        ((45, 3), (55, 3), (55, 5), (45, 5), (45, 3)),
-    )
+    outline = (0, -2), (0, 6), (80, 6), (80, -2), (0, -2)
+    island = (45, 3), (55, 3), (55, 5), (45, 5), (45, 3)
     areas = [line((x, y), (x + length, y), (x + length, y + 4), (x, y + 4)) for x, y, length in AREAS]
     drive = {"dataset": "nuscenes", "map": "boston-seaport", "date": "2018-08-01"}
     return {

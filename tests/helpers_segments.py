@@ -189,12 +189,8 @@ def crossing_road(arm: float = 120.0) -> RoadMap:
     successors = [(k, 8 + 3 * k + m) for k in range(4) for m in range(3)]
     successors += [(8 + 3 * k + m, 4 + (k + way) % 4) for k in range(4) for m, way in enumerate((2, 3, 1))]
     middle = np.stack([np.zeros_like(down), down], -1)
-    return make_road(
-        lanes,
-        successors,
-        boundary=[turned(edge, k) for k in range(4)],
-        marks=[turned(middle, k) for k in range(4)],
-    )
+    edges, marks = ([turned(line, k) for k in range(4)] for line in (edge, middle))
+    return make_road(lanes, successors, boundary=edges, marks=marks)
 
 
 def crossing(

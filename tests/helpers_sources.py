@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
 
 from symphony.data.segment import RoadMap, RunSegment
@@ -16,6 +17,10 @@ from symphony.data.sources import womd_pb2 as pb
 from symphony.errors import DataError
 from symphony.geometry import segments_of, signed_distance
 
+IN_FOLDER = settings(
+    deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+"""Of laws whose examples are written into one folder."""
 FAR = np.array([-7792.0, 81234.0, -184.0])
 """Where the made WOMD scenarios lie: far enough that float32 would lose millimetres."""
 

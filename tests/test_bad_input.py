@@ -7,10 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from helpers_sources import RECTANGLE, ROAD, commonroad, driver, read_error, read_one, womd_scenario
+from helpers_sources import (
+    IN_FOLDER,
+    RECTANGLE,
+    ROAD,
+    commonroad,
+    driver,
+    read_error,
+    read_one,
+    womd_scenario,
+)
 from symphony.data.convert import convert
 from symphony.data.segment import RunSegment, content_hash, validate
 from symphony.data.sources import get_reader, readers
@@ -18,10 +27,6 @@ from symphony.data.sources.base import Item
 from symphony.data.sources.commonroad import NO_LANELET, NO_LIGHT, NO_OBSTACLE
 from symphony.data.sources.tfrecord import masked_crc32c, write_records
 from symphony.errors import DataError
-
-IN_FOLDER = settings(
-    deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
 
 GOOD = commonroad(ROAD, driver(7), driver(8, x=20))
 
@@ -45,9 +50,7 @@ def hashes(items: list[Item]) -> list[str | None]:
 @pytest.mark.parametrize("name", readers())
 def test_things_that_are_no_files_of_the_format(name: str, tmp_path: Path) -> None:
     if name == "argoverse2":
-        pytest.importorskip(
-            "pyarrow", reason="pyarrow is not installed (pip install 'symphony-traffic[argoverse2]')"
-        )
+        pytest.importorskip("helpers_argoverse2")
     empty, noise, text = tmp_path / "empty", tmp_path / "noise", tmp_path / "text"
     empty.touch()
     noise.write_bytes(np.random.default_rng(0).bytes(5000))

@@ -109,10 +109,8 @@ def test_the_ego_has_the_most_moving_neighbours(path: Path) -> None:
         names = [item.segment_id for item in items if isinstance(item, RunSegment)]
         assert names == [f"ZAM_Made-1_1_T-1_ego{ego}" for ego in (5, 6, 8, 9)]
         # All in one frame, on one map.
-        assert (
-            len({content_hash(i.replace(ego=0, segment_id="")) for i in items if isinstance(i, RunSegment)})
-            == 1
-        )
+        alike = [item.replace(ego=0, segment_id="") for item in items if isinstance(item, RunSegment)]
+        assert len({content_hash(item) for item in alike}) == 1
 
 
 # Lanelets
@@ -122,13 +120,9 @@ def test_lanes(path: Path) -> None:
     near = lanelet(12, [(0, 6), (50, 6)], [(0, 2), (50, 2)], '<adjacentRight ref="10" drivingDir="same"/>')
     opposite = '<adjacentLeft ref="10" drivingDir="opposite"/>'
     against = lanelet(13, [(50, -2), (0, -2)], [(50, -6), (0, -6)], opposite)
-    main = lanelet(
-        10,
-        [(0, 2), (50, 2)],
-        [(0, -2), (20, -2), (50, -2)],
-        '<successor ref="11"/><successor ref="99"/><adjacentLeft ref="12" drivingDir="same"/>'
-        '<adjacentRight ref="13" drivingDir="opposite"/>',
-    )
+    links = '<successor ref="11"/><successor ref="99"/><adjacentLeft ref="12" drivingDir="same"/>'
+    links += '<adjacentRight ref="13" drivingDir="opposite"/>'
+    main = lanelet(10, [(0, 2), (50, 2)], [(0, -2), (20, -2), (50, -2)], links)
     after = lanelet(11, [(50, 2), (100, 2)], [(50, -2), (100, -1)], '<predecessor ref="10"/>')
     road = convert(path, driver(7), main, after, near, against).road
     assert road.lane_id.tolist() == [10, 11, 12, 13]
@@ -190,10 +184,8 @@ def test_the_boundary_is_open_where_the_network_is_cut(path: Path) -> None:
     turn = lanelet(12, [(100, 2), (120, 2)], [(100, -2), (120, -2)], '<predecessor ref="11"/>')
     for road, end in ((ROAD, 100), (ROAD + turn, 120)):
         segment = convert(path, road, driver(7))
-        inside, outside = (
-            [(50, 0), (end + 9, 0), (end + 30, 1), (-9, -1)],
-            [(50, 3), (end - 1, 3), (end + 9, 9)],
-        )
+        inside = [(50, 0), (end + 9, 0), (end + 30, 1), (-9, -1)]
+        outside = [(50, 3), (end - 1, 3), (end + 9, 9)]
         away = off_road(segment.road, np.array(inside + outside) - segment.origin[:2])
         assert (away > 0).tolist() == [False] * 4 + [True] * 3
         lines = [segment.road.boundary[k] + segment.origin for k in range(len(segment.road.boundary))]
@@ -210,16 +202,7 @@ BOX = st.tuples(*(st.floats(a, b) for a, b in ((-50, 50), (-50, 50), (0.1, 20), 
 
 
 @settings(max_examples=40, deadline=None)
-@example(
-    [
-        (0, 0, 1, 1, 0),
-        (0, 0, 1, 1, 1),
-        (0, 0, 1, 1, 1),
-        (0, 0, 2, 1, TINY),
-        (0, TINY, 3, 1, 0),
-        (2, 0, 1, 1, 2),
-    ]
-)
+@example([(0, 0, 1, 1, 0), *[(0, 0, 1, 1, 1)] * 2, (0, 0, 2, 1, TINY), (0, TINY, 3, 1, 0), (2, 0, 1, 1, 2)])
 @given(st.lists(BOX, min_size=1, max_size=6))
 def test_rings_bound_the_union(boxes: list[tuple[float, ...]]) -> None:
     outlines = []

@@ -145,15 +145,14 @@ def test_headings_that_are_not_those_of_the_motion(tmp_path: Path) -> None:
     assert read_error("interaction", path).field == "psi_rad"
     np.testing.assert_allclose(read_one("interaction", path, motion="positions").heading, 0, atol=1e-3)
     # What stands before it moves is turned as well, and small differences are none.
-    rows = turned(track(0, speed=0, steps=range(30)), 2.5) + turned(
-        track(0, x=-30, steps=range(30, 120)), 0.3
-    )
+    still, later = track(0, speed=0, steps=range(30)), track(0, x=-30, steps=range(30, 120))
+    rows = turned(still, 2.5) + turned(later, 0.3)
     both = read_one("interaction", public(tmp_path, rows), motion="positions").heading[0]
     np.testing.assert_allclose(both, np.where(np.arange(101) < 30, 0, 0.3), atol=1e-3)
     # One that stands keeps the heading that was logged.
     rows = [*raw(), *turned(track(9, x=20, speed=0), 1.25)]
-    still = read_one("interaction", public(tmp_path, rows), motion="positions")
-    np.testing.assert_allclose(still.heading[3], 1.25, rtol=1e-6)
+    found = read_one("interaction", public(tmp_path, rows), motion="positions")
+    np.testing.assert_allclose(found.heading[3], 1.25, rtol=1e-6)
 
 
 def test_states_logged_twice(tmp_path: Path) -> None:

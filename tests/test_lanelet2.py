@@ -8,17 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers_interaction import BORDER, DASHED, LANELETS, ORIGIN, PARKING, ROAD, WAYS, osm, with_area
-from helpers_sources import off_road
+from helpers_sources import IN_FOLDER, off_road
 from symphony.data.segment import LaneType, MarkType, RoadMap
 from symphony.data.sources import lanelet2
 from symphony.data.sources.lanelet2 import mercator, middle, read_lanelet2, road_map, stop_line, utm
 from symphony.errors import DataError
 
-IN_FOLDER = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 FROM_ORIGIN = partial(mercator, origin=np.array(ORIGIN))
 
 
@@ -70,7 +69,7 @@ def test_the_boundary_is_open_at_both_ends(tmp_path: Path) -> None:
     assert len(road.boundary) == 2
 
 
-@settings(IN_FOLDER, max_examples=25)
+@IN_FOLDER
 @given(st.lists(st.booleans(), min_size=len(WAYS), max_size=len(WAYS)), st.booleans())
 def test_the_direction_of_ways_does_not_matter(tmp_path: Path, turned: list[bool], swapped: bool) -> None:
     ways = {
@@ -79,9 +78,8 @@ def test_the_direction_of_ways_does_not_matter(tmp_path: Path, turned: list[bool
     }
     lanelets = dict(reversed(LANELETS.items())) if swapped else LANELETS
     road, same = road_of(tmp_path, osm(ways=ways, lanelets=lanelets)), road_of(tmp_path, osm())
-    links = [
-        {tuple(pair) for pair in road.lane_id[e].tolist()} for e in (road.successors, road.left_neighbors)
-    ]
+    pairs = (road.lane_id[links].tolist() for links in (road.successors, road.left_neighbors))
+    links = [set(map(tuple, each)) for each in pairs]
     assert links == [{(101, 103), (102, 104)}, {(101, 102), (103, 104)}]
     for k, lane in enumerate(np.argsort(road.lane_id)):
         np.testing.assert_allclose(road.lanes[int(lane)], same.lanes[k], atol=1e-6)
@@ -118,7 +116,7 @@ def test_speed_limits(tmp_path: Path) -> None:
         np.testing.assert_allclose(road_of(tmp_path, content).speed_limit[0], expected, 1e-6)
 
 
-@settings(IN_FOLDER, max_examples=20)
+@IN_FOLDER
 @given(turned=st.tuples(*[st.booleans()] * 5), first=st.integers(0, 2))
 def test_areas_are_road_but_for_their_holes(tmp_path: Path, turned: tuple[bool, ...], first: int) -> None:
     outer = ["61o", "62o", "63o"]

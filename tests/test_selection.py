@@ -25,12 +25,10 @@ EAST = np.asarray([[-200.0, 0], [200, 0]])
 BESIDE = NORTH + np.asarray([3.5, 0])
 """The next lane to the right of NORTH."""
 ONCOMING = NORTH[::-1] + np.asarray([-3.5, 0])
-TURN_IN = np.concatenate(
-    [[[-100.0, 10]], np.stack([-10 + 10 * np.sin(ARC), 20 - 10 * np.cos(ARC)], -1), [[0, 200]]]
-)
+TURN_IN = np.asarray([(-100, 10), *zip(-10 + 10 * np.sin(ARC), 20 - 10 * np.cos(ARC), strict=True), (0, 200)])
 """From the west into NORTH, which it reaches at y = 20, 100.7 m on."""
-TURN_OFF = np.concatenate(
-    [[[0.0, -200]], np.stack([-10 + 10 * np.cos(ARC), -20 + 10 * np.sin(ARC)], -1), [[-200, -10]]]
+TURN_OFF = np.asarray(
+    [(0, -200), *zip(10 * np.cos(ARC) - 10, 10 * np.sin(ARC) - 20, strict=True), (-200, -10)]
 )
 CREEP = np.minimum(0.5 * TIME, 4)
 CHANGE_LANE = np.asarray([[3.5, -200], [3.5, -30], [0, 0], [0, 200]])
@@ -248,7 +246,7 @@ def test_too_few_crowds_and_large_maps_are_left_out() -> None:
     assert [excluded(crowd, 2), excluded(crowd, 3), excluded(unseen, 2)] == ["playback_agents", "", ""]
     # By its length, not by how densely it is drawn.
     assert contexts.road_points(with_lane(100, 0.1)) == contexts.road_points(with_lane(100, 50)) == 51
-    assert (excluded(with_lane(19_990, 0.5), 2), excluded(with_lane(20_010, 50), 2)) == (
+    assert [excluded(with_lane(*size), 2) for size in ((19_990, 0.5), (20_010, 50))] == [
         "",
         "roadgraph_points",
-    )
+    ]
