@@ -110,10 +110,9 @@ def test_nothing_usable_is_an_error_and_leaves_nothing(logs: Write, out: Path) -
 
 def test_what_exists_is_not_written_over(logs: Write, out: Path, tmp_path: Path) -> None:
     path = logs("a.scene", "straight 1")
-    with pytest.raises(DataError, match="not a segment store"):
-        convert(FakeReader(), [path], tmp_path / "logs")
-    with pytest.raises(DataError, match="not a segment store"):
-        convert(FakeReader(), [path], path)
+    for place in (path.parent, path):
+        with pytest.raises(DataError, match="not a segment store"):
+            convert(FakeReader(), [path], place)
     assert path.read_text() == "straight 1"
     convert(FakeReader(), [path], out)
     checksum = SegmentStore(out).checksum()
@@ -136,13 +135,9 @@ def test_directories_are_searched(logs: Write, tmp_path: Path) -> None:
     folder = tmp_path / "logs"
     assert expand([folder], patterns) == sorted(paths[:3])
     assert expand([paths[3], folder, paths[0]], patterns) == [paths[3], *sorted(paths[:3])]
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match=r"no \.scene or \.scene-\*-of-\* files in .*empty"):
-        expand([tmp_path / "empty"], patterns)
-    with pytest.raises(DataError, match="nowhere: no such file"):
-        expand([folder, tmp_path / "nowhere"], patterns)
-    with pytest.raises(DataError, match="no files given"):
-        expand([], patterns)
+    for nothing, message in (([tmp_path / "nowhere"], "no such file"), ([], "no files given")):
+        with pytest.raises(DataError, match=message):
+            expand([*nothing], patterns)
 
 
 def test_info_counts_what_is_there(logs: Write, out: Path) -> None:
@@ -499,7 +494,6 @@ def test_what_is_in_the_way_is_told(paths: list[Path], tmp_path: Path) -> None:
     with pytest.raises(DataError, match="unfinished conversion to that name: delete one of them"):
         convert(FakeReader(), paths, out)
     shutil.rmtree(out)
-    for damaged, message in (("[]", "not an object"), ('{"files": [1]}', "not the job of a conversion")):
-        (partial / "job.json").write_text(damaged)
-        with pytest.raises(DataError, match=message):
-            convert(FakeReader(), paths, out)
+    (partial / "job.json").write_text('{"files": [1]}')
+    with pytest.raises(DataError, match="not the job of a conversion"):
+        convert(FakeReader(), paths, out)

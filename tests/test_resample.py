@@ -63,14 +63,6 @@ def test_interpolation_is_exact_for_uniform_motion() -> None:
     )
 
 
-def test_headings_take_the_shorter_arc() -> None:
-    log = straight_road(1, steps=3, dt=0.1)
-    heading = np.array([[np.pi - 0.1, -np.pi + 0.1, np.pi - 0.1]], np.float32)
-    new = resample(log.replace(heading=heading), 0.05)
-    assert np.abs(np.cos(new.heading[0, 1::2]) + 1).max() < 1e-6
-    assert np.abs(np.diff(np.unwrap(new.heading[0].astype(float)))).max() < 0.11
-
-
 def test_between_a_valid_and_an_invalid_step_nothing_is_made_up() -> None:
     log = hide(straight_road(2, steps=11, dt=0.1), 1, slice(4, 6))
     new = resample(log, 0.05)

@@ -160,20 +160,6 @@ def test_a_partner_that_is_seen_throughout_goes_first() -> None:
     assert interactive_choice(alone, 2).context == context
 
 
-@pytest.mark.parametrize("tile", [60, 5 * STEPS])
-def test_tiles_of_any_size_give_the_same(tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    turns, crosses = (TURN_IN, 12 * TIME + 60), (EAST, 15 * TIME + 120)
-    cars = scene([(NORTH, 30 * TIME + 50), turns, crosses, (NORTH, 80)])
-    segments = [cars, crossing(6, steps=60, seed=3), straight_road(9, steps=40)]
-    whole = [relations(each, np.arange(1, each.num_agents)) for each in segments]
-    monkeypatch.setattr(contexts, "TILE", tile)
-    for segment, expected in zip(segments, whole, strict=True):
-        found = relations(segment, np.arange(1, segment.num_agents))
-        np.testing.assert_array_equal(found, expected)
-    assert any(np.isfinite(each.merge).any() for each in whole)
-    assert any(np.isfinite(each.crossing).any() for each in whole)
-
-
 def abreast(distances: list[float], speeds: list[float], **changes: Any) -> RunSegment:
     """The ego at x = 0 and others at given distances, all going along +y; 6 steps of 1 s."""
     x = np.asarray([0.0, *distances])

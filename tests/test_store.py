@@ -363,16 +363,6 @@ def test_what_breaks_the_schema_is_refused(filled: Path, column: str, data: byte
     assert (caught.value.file, caught.value.segment, caught.value.field) == (filled, "crossing-1", field)
 
 
-@pytest.mark.parametrize("column", ["segment_id", "source", "file", "tags"])
-@pytest.mark.parametrize("data", [b"\xff", b"["])
-def test_texts_that_are_none(tmp_path: Path, column: str, data: bytes) -> None:
-    with StoreWriter(tmp_path / "b") as writer:
-        writer.append(crossing(file="b.xml"), tags={"a": "b"})
-    change(tmp_path / "b" / "columns" / f"{column}.bin", 0, data)
-    with pytest.raises(DataError, match=r"field tags: not JSON" if column == "tags" else "its hash"):
-        _ = SegmentStore(tmp_path / "b")[0]
-
-
 WRONG = [(field, value) for field in ("steps", "map", "ego", "count") for value in (2**62, -1, 2**63 - 1)]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import time
 from dataclasses import replace
@@ -22,7 +21,6 @@ from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
-from symphony.envs import Bicycle
 from symphony.errors import ConfigError, SymphonyError
 from symphony.evaluation import Evaluation, evaluate
 from symphony.learning.demonstrations import SceneDataset
@@ -145,18 +143,6 @@ def test_a_worker_that_dies_names_the_segments_at_hand(store: SegmentStore) -> N
     named = str(error.value).rpartition(" segments ")[2].split(", ")
     assert store.ids[2] in named
     assert len(named) <= 2
-
-
-def test_what_is_sent_comes_back_whole(store: SegmentStore) -> None:
-    dataset = SceneDataset(store, 2, Bicycle(), [3, 1], routes=True, duration=1, keep=2)
-    dataset.scene(0)
-    copy = pickle.loads(pickle.dumps(dataset))  # noqa: S301
-    for name in ("interactive", "dynamics", "indices", "routes", "duration", "keep", "dt"):
-        assert getattr(copy, name) == getattr(dataset, name)
-    assert copy.store.path == store.path
-    error = NotFiniteError("policy", 1, 4, 2).named("s")
-    again = pickle.loads(pickle.dumps(error))  # noqa: S301
-    assert (str(again), vars(again)) == (str(error), vars(error))
 
 
 def test_what_cannot_be_sent_is_refused(store: SegmentStore) -> None:
