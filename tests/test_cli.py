@@ -9,7 +9,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from itertools import pairwise
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +18,16 @@ import tyro
 
 import symphony.data.convert
 from helpers_cli import commands, help_of, words
-from helpers_interaction import public, track
 from helpers_processes import apart
 from helpers_saved import played
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
-from symphony import __version__, cli, config
+from symphony import __version__
 from symphony.agents import Agent, discriminator_network, goal_network, policy_network
 from symphony.cli import GONE, main
 from symphony.cli.data import Info
 from symphony.cli.recipe import Arguments
-from symphony.cli.shared import print_metrics, print_table
+from symphony.cli.shared import print_table
 from symphony.config import METHODS, TrainConfig
 from symphony.config.profiles import PROFILES, expanded
 from symphony.data.segment import RunSegment
@@ -59,13 +58,6 @@ class MadeReader(Reader):
         yield DataError("has 5 wheels", file=path, segment="spare", field="agents")
 
 
-@pytest.fixture
-def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    monkeypatch.setattr(symphony.data.convert, "get_reader", lambda name, **options: MadeReader())
-    files = [tmp_path / "one.made", tmp_path / "two.made"]
-    return [str(file) for file in files if not file.write_text("")]
-
-
 @pytest.mark.parametrize("command", commands(), ids=" ".join)
 def test_every_option_is_explained_in_whole_sentences(command: tuple[str, ...]) -> None:
     told = help_of(*command)
@@ -74,14 +66,6 @@ def test_every_option_is_explained_in_whole_sentences(command: tuple[str, ...]) 
     assert len(helps) == len(re.findall("^  --[a-z]", told, re.M))
     for name, text in helps:
         assert re.search(r"\s[A-Z`].*\.$", text, re.S), f"--{name}: {text!r}"
-
-
-def test_paragraphs_of_help_are_not_broken_where_their_source_is() -> None:
-    """Of lines after the first, tyro joins those to the one before that begin with a letter."""
-    for file in [*Path(cli.__file__).parent.glob("*.py"), *Path(config.__file__).parent.glob("*.py")]:
-        lines = file.read_text().splitlines()
-        for before, line in pairwise(map(str.strip, lines)):
-            assert not (before[:2] == line[:2] == "#:") or line[3].isalpha(), f"{file}: {line}"
 
 
 def test_training_has_at_most_fifty_options() -> None:
@@ -186,8 +170,11 @@ def test_a_closed_pipe_is_no_traceback(store: Path, tmp_path: Path) -> None:
     assert process.exitcode == 1
 
 
-def test_convert_reports_what_it_did(logs: list[str], tmp_path: Path, capsys: Any) -> None:
-    out = tmp_path / "out"
+def test_convert_reports_what_it_did(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    monkeypatch.setattr(symphony.data.convert, "get_reader", lambda name, **options: MadeReader())
+    logs, out = [str(tmp_path / name) for name in ("one.made", "two.made")], tmp_path / "out"
+    for file in logs:
+        Path(file).touch()
     options = ["--out", str(out), "--rate", "2.5", "--interactive", "3", "--smooth", "0.1"]
     assert main(["data", "convert", "womd", *logs, *options]) == 0
     captured = capsys.readouterr()
@@ -196,23 +183,12 @@ def test_convert_reports_what_it_did(logs: list[str], tmp_path: Path, capsys: An
     assert "2 converted, 4 skipped" in captured.err
     assert SegmentStore(out).ids == ["one", "two"]
     assert SegmentStore(out)[0].dt == pytest.approx(0.4)
+    assert (
+        main(["data", "convert", "interaction", *logs, "--out", f"{out}-2", "--window", "4", "--egos", "all"])
+        == 0
+    )
     settings = SegmentStore(out).report["settings"]
     assert (settings["rate"], settings["interactive"], settings["smooth"]) == (2.5, 3, 0.1)
-
-
-def test_options_of_recordings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = [row for k in range(3) for row in track(k, x=-15 * k, y=2 + 4 * (k % 2), logged=0.5)]
-    file = str(public(tmp_path, rows))
-    command = ["data", "convert", "interaction", file, "--out"]
-    assert main([*command, str(tmp_path / "a"), "--window", "4"]) == 1
-    assert "0.50 times the speed of the positions" in capsys.readouterr().err
-    more = ["--motion", "positions", "--window", "4", "--stride", "2", "--egos", "all"]
-    assert main([*command, str(tmp_path / "a"), *more]) == 0
-    store = SegmentStore(tmp_path / "a")
-    # Of 11.9 s, windows begin at 0, 2 … 8 s, the last being 3.9 s long; three cars each.
-    assert len(store) == 5 * 3
-    assert len(store.map_hashes) == 1
-    assert set(store.groups.tolist()) == {"DR_X_000"}
 
 
 def test_info_as_json_and_as_text_agree(store: Path, capsys: Any) -> None:
@@ -232,14 +208,6 @@ def test_info_as_json_and_as_text_agree(store: Path, capsys: Any) -> None:
     assert {f"{name} {value}" for name, value in facts.items()} <= rows
     StoreWriter(store.parent / "empty").close()
     assert "none" in info(folder=store.parent / "empty")
-
-
-def test_plot_finds_a_segment_by_id_or_number(store: Path, tmp_path: Path) -> None:
-    out = tmp_path / "new" / "segment.svg"
-    for segment in ("straight", "1"):
-        assert main(["plot", "segment", str(store), "--segment", segment, "--out", str(out)]) == 0
-        assert "straight" in out.read_text()
-        out.unlink()
 
 
 @pytest.mark.parametrize(
@@ -289,27 +257,6 @@ def test_tables_are_aligned_and_never_break_a_name(capsys: pytest.CaptureFixture
     assert any(row.startswith("b\\x1b[2J ") for row in rows)
 
 
-def test_numbers_are_told_where_there_are_some(capsys: Any) -> None:
-    row: dict[str, Any] = dict.fromkeys(("offroad_time", "ade", "min_sade", "curvature_jsd"), 0.0)
-    row |= {"agent": "runs/bc", "collision_rate": 12.5, "collision_crossing": 12.5, "standing": float("nan")}
-    row |= {
-        "my:jerk": 1.5,
-        "my:jerk_se": 0.5,
-        "interactive": 2,
-        "rollouts": 4,
-        "segments": 2,
-        "groups": 2,
-        "seed": 0,
-    }
-    print_metrics([row])
-    short = capsys.readouterr().out.splitlines()
-    assert "bc: my:jerk 1.5000 ± 0.5000" in short  # was asked for
-    assert len(short) == 6  # with the table's lines, and one of what it is of
-    print_metrics([row], details=True)
-    told = {" ".join(line.split()) for line in capsys.readouterr().out.splitlines()}
-    assert {"collision crossing 12.5", "standing –"} <= told
-
-
 def test_doctor_simulates_and_says_what_is_there(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--json", "-"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -318,9 +265,7 @@ def test_doctor_simulates_and_says_what_is_there(capsys: pytest.CaptureFixture[s
     assert set(found["extras"]) == {"eclipse-sumo", "pyarrow", "ray", "imageio-ffmpeg", "gymnasium"}
 
 
-# Profiles of training settings
-
-
+@cache
 def settings(method: str, *args: str) -> TrainConfig:
     return tyro.cli(
         Arguments, args=expanded([method, "--data", "a", "--out", "b", "--test", "c", *args])
@@ -341,19 +286,14 @@ def test_every_profile_is_a_valid_configuration_of_every_method(profile: str) ->
 
 
 def test_the_paper_is_followed() -> None:
-    config = settings("mgail_ts_h", "--profile=paper")
+    config = settings("mgail_ts_h", "--profile=paper", "--interactive", "8", "--duration", "20")
+    assert (config.duration, config.agent.interactive) == (20, 8)
     search = config.search
     assert (config.steps, config.segments, config.checkpoint_every) == (70_000, 16, 2_000)
     assert (search.branches, search.test_branches, search.prune_every, search.rule) == (4, 16, 10, "best")
     assert (config.agent.num_points, config.validation.segments) == (1_000, 200)
     assert (config.mgail.regression, config.mgail.react, config.mgail.cost) == (0, True, "log_d")
     assert config.discriminator.features == "paper"
-
-
-def test_the_settings_of_the_paper_s_tables_are_options_of_every_recipe() -> None:
-    config = settings("bc", "--duration", "20", "--interactive", "8")
-    assert (config.duration, config.agent.interactive) == (20, 8)
-    assert config == settings("bc", "--duration", "20", "--agent.interactive", "8")
 
 
 def test_what_is_given_has_precedence() -> None:

@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 
 from symphony.cli import main
 from symphony.render import plot_curves
-from symphony.render.curves import DASHES, PANELS, panels_of, read_curves, run_colors, smoothed
+from symphony.render.curves import read_curves, smoothed
 from symphony.render.style import AGENT_COLORS
 
 
@@ -70,30 +70,6 @@ def test_smoothing_stays_within_the_values_around(values: np.ndarray, window: fl
         near = near[np.isfinite(near)]
         expected = near.mean() if len(near) else math.nan
         assert average == pytest.approx(expected, abs=1e-6, nan_ok=True)
-
-
-def test_curves_of_choice(tmp_path: Path) -> None:
-    (axes,) = plot_curves(
-        {"one": records(auc=0.1, loss_bc=1.0)}, tmp_path / "a.png", metrics=["auc"], window=0
-    ).axes
-    np.testing.assert_array_equal(axes.lines[0].get_ydata(), axes.lines[1].get_ydata())
-
-
-def test_panels_hold_each_metric_once_and_how_it_ran_comes_last() -> None:
-    grouped = [name for names in PANELS.values() for name in names]
-    quantiles = [f"preview_speed_p{q}" for q in (90, 50, 10)]
-    present = ["skipped_updates", "updates_per_second", *grouped, *quantiles, "mine", "learning_rate"]
-    panels = panels_of(present)
-    assert sorted(name for names in panels.values() for name in names) == sorted(present)
-    assert panels["preview speed"] == quantiles
-    assert panels["policy loss"] == ["loss_policy", "loss_mgail", "loss_regression"]
-    assert list(panels)[-4:] == ["mine", "updates per second", "learning rate", "skipped updates"]
-    # More lines could not be told apart.
-    assert max(len(names) for names in panels.values()) <= len(DASHES)
-    assert all(len(set(run_colors(count))) == count for count in (1, 6, 7, 30))
-
-
-# The command line
 
 
 def test_the_command_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

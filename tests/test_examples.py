@@ -137,6 +137,7 @@ def test_many_machines(example: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", ["Everything", "Others"])
 def test_attention_looks_at_nothing_that_is_not_there(name: str, example: Any) -> None:
+    """Nor does it matter how many are not there, nor in which order they are."""
     torch.manual_seed(0)
     encoder = getattr(example("attention"), name)(3, [4, 2], hidden=8)
     own, valid = torch.randn(2, 3, 3), torch.tensor([[True, True, False]] * 2)
@@ -146,20 +147,15 @@ def test_attention_looks_at_nothing_that_is_not_there(name: str, example: Any) -
     found = encoder(own, valid, few, there, many, near)
     assert found.shape == (2, 3, encoder.width)
     hidden = [torch.where(mask[..., None], x, 9.0) for x, mask in ((few, there), (many, near))]
-    # Nor does it matter how many are not there, nor in which order they are.
-    more, absent = torch.cat([few, few[:, :, :2]], 2), torch.zeros(2, 3, 2, dtype=torch.bool)
-    for same in (
-        (hidden[0], there, hidden[1], near),
-        (more, torch.cat([there, absent], 2), many, near),
-        (few.flip(2), there.flip(2), many.flip(2), near.flip(2)),
-    ):
+    more, padded = torch.cat([few, few[:, :, :2]], 2), torch.nn.functional.pad(there, (0, 2))
+    flipped = [x.flip(2) for x in (few, there, many, near)]
+    for same in ((hidden[0], there, hidden[1], near), (more, padded, many, near), flipped):
         torch.testing.assert_close(encoder(own, valid, *same), found)
     few[1, 0, there[1, 0].nonzero()[0]] += 1.0
     changed = (encoder(own, valid, few, there, many, near) != found).any(-1)
     assert changed.tolist() == [[False] * 3, [True, False, False]]
     found.square().sum().backward()
-    gradients = [weight.grad for weight in encoder.parameters() if weight.grad is not None]
-    assert all(gradient.isfinite().all() for gradient in gradients)
+    assert all(weight.grad.isfinite().all() for weight in encoder.parameters() if weight.grad is not None)
 
 
 def test_a_recipe_learns_with_attention(example: Any, tmp_path: Path) -> None:
@@ -237,4 +233,3 @@ def test_the_table_of_all_methods(tmp_path: Path, monkeypatch: Any, capsys: Any)
         assert sum(line.strip("| *").startswith(f"{name} ") for line in lines) == 1, name
         config = json.loads((out / method / "config.json").read_text())
         assert (config["method"], config["steps"], config["search"]["branches"]) == (method, 2, 2)
-    assert "MGAIL+TS+H" in shown.out

@@ -36,20 +36,19 @@ def little_memory(most: float) -> Iterator[None]:
     assert peak < most
 
 
-def test_many_parked_cars_and_one_late_state(tmp_path: Path) -> None:
-    parked = [obstacle(100 + k, [state(0, k, 5)], role="static") for k in range(700)]
+def test_many_parked_cars_one_late_state_and_files_beyond_all_measure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parked, path = (
+        [obstacle(100 + k, [state(0, k, 5)], role="static") for k in range(700)],
+        tmp_path / "a.xml",
+    )
     late = driver(7).replace("<exact>4</exact>", "<exact>9900</exact>", 1)
-    path = tmp_path / "a.xml"
     path.write_text(commonroad(ROAD, late, driver(8), *parked))
     with little_memory(40e6):
         error = read_error("commonroad", path)
     assert error.field == "time"
     assert "states" in error.message
-
-
-def test_files_beyond_all_measure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a.xml"
-    path.write_text(commonroad(ROAD, driver(7), driver(8)))
     monkeypatch.setattr("symphony.data.sources.base.MAX_FILE", path.stat().st_size - 1)
     assert "too large" in read_error("commonroad", path).message
 
@@ -151,16 +150,16 @@ def test_names_of_files_that_are_not_text(name: str, tmp_path: Path) -> None:
     assert not list(tmp_path.glob("out*"))
 
 
-def test_reports_that_are_none(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "change", [{"converted": "many"}, {"skipped": [3]}, {"settings": []}, {"odd": 3}, {"files": None}]
+)
+def test_reports_that_are_none(change: dict[str, object], tmp_path: Path) -> None:
     (tmp_path / "a.scene").write_text("straight 1")
     convert(FakeReader(), [tmp_path / "a.scene"], tmp_path / "out")
     path = tmp_path / "out" / "report.json"
-    good = json.loads(path.read_text())
-    wrong = {"converted": "many", "skipped": [3], "settings": [], "odd": 3, "files": None}
-    for key, value in wrong.items():
-        path.write_text(json.dumps(good | {key: value}))
-        with pytest.raises(DataError, match="not a conversion report"):
-            converting.info(tmp_path / "out")
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(DataError, match="not a conversion report"):
+        converting.info(tmp_path / "out")
 
 
 @pytest.mark.parametrize("field", ["exit_lanes", "lane_states", "map_features", "objects_of_interest"])

@@ -19,7 +19,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.axes import Axes
-from matplotlib.colors import to_hex, to_rgb, to_rgba
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_hex, to_rgb
 from PIL import Image, ImageSequence
 
 from helpers_segments import crossing, hide, straight_road
@@ -37,7 +38,6 @@ from symphony.render.style import (
     PLAYBACK,
     ROAD,
     new_figure,
-    scale_length,
     view_around,
 )
 from symphony.render.video import frames_of
@@ -65,8 +65,6 @@ def corners(collection: Any) -> np.ndarray:
     return np.stack([path.vertices[:4] for path in collection.get_paths()])
 
 
-# Geometry
-
 numbers = st.floats(-50, 50, width=32)
 
 
@@ -88,12 +86,10 @@ def test_box_agrees_with_shapely_and_its_nose_is_ahead(
 def test_pieces_join_valid_steps_only(valid: np.ndarray) -> None:
     path = np.stack([np.arange(len(valid)), -np.arange(len(valid))], -1).astype(float)
     found, begin = pieces(path, valid)
-    expected = [k for k in range(len(valid) - 1) if valid[k] and valid[k + 1]]
-    assert begin.tolist() == expected
-    assert found[:, 0, 0].tolist() == expected
+    expected = np.flatnonzero(valid[1:] & valid[:-1]).tolist()
+    assert begin.tolist() == found[:, 0, 0].tolist() == expected
     assert (found[:, 1] - found[:, 0] == [1, -1]).all()
-    hidden = np.where(valid[:, None], path, np.nan)
-    assert pieces(hidden)[1].tolist() == expected
+    assert pieces(np.where(valid[:, None], path, np.nan))[1].tolist() == expected
 
 
 @settings(deadline=None)
@@ -116,13 +112,6 @@ def test_arrows_lie_on_the_lane_and_point_along_it(count: int, length: float, se
         assert np.abs(direction - steps[near] / length).max(-1).min() < 1e-6
 
 
-@given(st.floats(1e-3, 1e5))
-def test_scale_bar_is_round_and_fits(span: float) -> None:
-    length = scale_length(span)
-    assert span / 12.6 < length <= span / 5 * (1 + 1e-9)
-    assert round(length / 10 ** math.floor(math.log10(length) + 1e-9), 6) in {1, 2, 5}
-
-
 @given(arrays(np.float64, st.tuples(st.integers(1, 9), st.just(2)), elements=st.floats(-500, 500)))
 def test_view_holds_the_points_with_their_margin(points: np.ndarray) -> None:
     x0, x1, y0, y1 = view_around(points, margin=20, least=70)
@@ -137,15 +126,11 @@ def test_colors_can_be_told_apart_by_all_eyes() -> None:
     # Severe deuteranopia and protanopia (Machado et al. 2009), on linear RGB.
     deutan = [0.367322, 0.860646, -0.227968, 0.280085, 0.672501, 0.047413, -0.01182, 0.04294, 0.968881]
     protan = [0.152286, 1.052583, -0.204868, 0.114503, 0.786281, 0.099216, -0.003882, -0.048116, 1.051998]
-    colors = [*AGENT_COLORS, PLAYBACK, ROAD]
-    linear = np.array([to_rgba(color)[:3] for color in colors]) ** 2.2
+    linear = np.array([to_rgb(color) for color in (*AGENT_COLORS, PLAYBACK, ROAD)]) ** 2.2
     for eye in (np.eye(3), np.reshape(deutan, (3, 3)), np.reshape(protan, (3, 3))):
         seen = np.clip(linear @ eye.T, 0, 1) ** (1 / 2.2)
-        for a, b in itertools.combinations(range(len(colors)), 2):
-            assert np.linalg.norm(seen[a] - seen[b]) > 0.25, (colors[a], colors[b])
-
-
-# Run segments
+        for a, b in itertools.combinations(seen, 2):
+            assert np.linalg.norm(a - b) > 0.25
 
 
 @pytest.mark.parametrize(("suffix", "head"), [("png", b"\x89PNG\r\n"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
@@ -236,27 +221,12 @@ def test_marks_of_every_kind_are_drawn() -> None:
     assert "stop sign" in labels(axes)
 
 
-def test_the_ego_keeps_its_colour_and_an_outline_and_a_crowds_legend_is_short() -> None:
-    segment = straight_road(30)
-    axes = plot_segment(segment, blank(), interactive=list(range(1, 30)))
-    faces = {k: tuple(by_gid(axes, f"box-{k}").get_facecolor()[0]) for k in range(30)}
-    assert [k for k, face in faces.items() if face[:3] == to_rgb(AGENT_COLORS[0])] == [segment.ego]
-    edges = {k: tuple(by_gid(axes, f"box-{k}").get_edgecolor()[0][:3]) for k in range(30)}
-    assert [k for k, edge in edges.items() if edge == to_rgb(INK)] == [segment.ego]
-    named = [label for label in labels(axes) if label.startswith(("ego", "interactive"))]
-    assert len(named) == 8
-    assert "and 22 more in colour" in labels(axes)
-
-
 def test_unknown_kinds_of_pictures_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"\.png"):
         plot_segment(crossing(), tmp_path / "a.docx")
     with pytest.raises(ConfigError, match=r"\.gif"):
         animate_rollouts([rollouts(crossing(3, steps=4), [0])], tmp_path / "a.png")
     assert not list(tmp_path.iterdir())
-
-
-# Rollouts
 
 
 def rollouts(segment: RunSegment, agents: list[int], count: int = 3, start: int = 0, **flags: Any) -> Clip:
@@ -336,26 +306,22 @@ def test_playback_vehicles_are_drawn_where_they_were_hit() -> None:
     assert "hit" not in gids(plot_rollout(rollouts(segment, [0], 1), blank()))
 
 
-def test_rollouts_that_are_the_same_are_counted_once() -> None:
-    segment = straight_road(4, steps=12)
-    told = {(0,): "1 rollout", (0, 1): "2 rollouts", (0, 1, 0, 1, 1): "5 rollouts, 2 distinct"}
-    for kinds, words in told.items():
-        clip = rollouts(segment, [0], len(kinds), valid=np.arange(12) < 11)
-        clip.position[:] = segment.position[0, :, :2] + np.array(kinds)[:, None, None, None]
-        clip.position[..., -1, :] += np.arange(len(kinds))[:, None, None]  # not valid: no difference
-        axes = plot_rollout(clip, blank())
-        assert any(f"{words} of " in text.get_text() for text in axes.texts)
-
-
-def test_eight_agents_have_eight_colours_in_pictures_and_pages() -> None:
-    assert len(set(colors_of(straight_road(8), range(8)))) == 8
+def test_agents_have_their_colours_in_pictures_and_pages() -> None:
+    """Eight have eight, and the ego has its own among thirty; the legend of a crowd is short."""
     script = (Path(viewer.__file__).parent / "scene.js").read_text()
-    palette = re.search(r"const PALETTE = (\[.*?\]);", script)
-    assert palette is not None
-    assert json.loads(palette[1]) == [color.lower() for color in AGENT_COLORS]
-
-
-# Several pictures
+    (palette,) = re.findall(r"const PALETTE = (\[.*?\]);", script)
+    assert json.loads(palette) == [color.lower() for color in AGENT_COLORS]
+    assert len(set(colors_of(straight_road(8), range(8)))) == 8
+    segment = straight_road(30)
+    axes = plot_segment(segment, blank(), interactive=list(range(1, 30)))
+    for drawn, color in (
+        (PolyCollection.get_facecolor, AGENT_COLORS[0]),
+        (PolyCollection.get_edgecolor, INK),
+    ):
+        shown = [tuple(drawn(by_gid(axes, f"box-{k}"))[0][:3]) for k in range(30)]
+        assert [k for k in range(30) if shown[k] == to_rgb(color)] == [segment.ego]
+    assert len([label for label in labels(axes) if label.startswith(("ego", "interactive"))]) == 8
+    assert "and 22 more in colour" in labels(axes)
 
 
 def test_panels_of_a_grid_are_of_one_size_however_far_rollouts_go(tmp_path: Path) -> None:
@@ -385,9 +351,6 @@ def test_routes_of_agents_are_drawn(tmp_path: Path) -> None:
     picture = tmp_path / "routes.png"
     assert main(["plot", "routes", "--data", str(tmp_path / "store"), "--out", str(picture)]) == 0
     assert picture.stat().st_size > 20_000
-
-
-# Films
 
 
 def frames(clips: list[Clip], path: Path) -> np.ndarray:

@@ -27,7 +27,7 @@ from symphony.envs.scene import scene
 from symphony.errors import DataError
 from symphony.evaluation.contacts import HORIZON, time_to_collision
 from symphony.evaluation.driving import Lanes, red_lights
-from symphony.evaluation.report import NUMBERS, Report, add_segment, report, total_numbers
+from symphony.evaluation.report import Report, add_segment, report, total_numbers
 from symphony.geometry import box_gap
 from symphony.rollouts.driving import playback
 from symphony.saved.folder import About, RolloutWriter, save_rollouts
@@ -171,11 +171,10 @@ def test_times_are_percent_of_what_was_driven() -> None:
     saved = played(driving((0, 0, 0, 7), (40, 0, 0, 7)), [0, 1], 2)
     saved.offroad[0, :5, 0] = True
     saved.counted[0, 10:, 1] = False  # its steps: 20 and 10
-    first, second = rows(saved)
-    assert (first["steps"], second["steps"]) == (30, 40)
-    assert first["offroad_time"] == pytest.approx(100 * 5 / 30)
-    assert second["offroad_time"] == 0
-    assert total_numbers([first, second])["offroad_time"] == pytest.approx(100 * 5 / 70)
+    found = rows(saved)
+    assert [row["steps"] for row in found] == [30, 40]
+    assert [row["offroad_time"] for row in found] == pytest.approx([100 * 5 / 30, 0])
+    assert total_numbers(found)["offroad_time"] == pytest.approx(100 * 5 / 70)
 
 
 def test_the_ego_alone_is_evaluated_on_request() -> None:
@@ -185,17 +184,6 @@ def test_the_ego_alone_is_evaluated_on_request() -> None:
     assert not rows(saved, "ego")[0]["collision"]
     with pytest.raises(DataError, match="ego was not driven"):
         rows(played(segment, [1]), "ego")
-
-
-def test_a_recording_without_a_number_is_no_sample_of_it() -> None:
-    base = dict.fromkeys(NUMBERS) | {"failed": "", "steps": 10, "logged_steps": 10}
-    rows = [
-        base | {"segment": group, "group": group, "progress": x}
-        for group, x in (("a", 3.0), ("b", None), ("c", 5.0))
-    ]
-    for count, expected in ((2, (3.0, None)), (3, (4.0, pytest.approx(1.0)))):
-        totals = total_numbers(rows[:count])
-        assert (totals["progress"], totals["progress_se"]) == expected
 
 
 def test_contacts_are_those_that_the_simulation_flagged() -> None:
@@ -247,27 +235,28 @@ def test_moving_and_turning_the_world_changes_nothing() -> None:
         assert two[name] == (pytest.approx(value, abs=2e-2) if isinstance(value, float) else value), name
 
 
-def test_the_command_writes_page_numbers_and_table(tmp_path: Path, capsys: Any) -> None:
+def test_the_command_writes_page_numbers_and_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    types, sim = np.array([AgentType.VEHICLE, AgentType.CYCLIST], np.uint8), tmp_path / "sim"
     hit = driving((0, 0, 0, 12), (10, 0, 0, 7), segment_id="a&b <i>")
-    types = np.array([AgentType.VEHICLE, AgentType.CYCLIST], np.uint8)
     free = driving((0, 0, 0, 7), (10, 0, 0, 7), segment_id="free", agent_type=types)
-    save_rollouts(tmp_path / "sim", ABOUT, [played(hit), played(free)])
-    assert main(["report", str(tmp_path / "sim")]) == 0
+    save_rollouts(sim, ABOUT, [played(hit), played(free)])
+    assert main(["report", str(sim)]) == 0
     assert re.search(r"max_jerk +0\.00 ", capsys.readouterr().out)
-    found = json.loads((tmp_path / "sim" / "report.json").read_text())
+    found = json.loads((sim / "report.json").read_text())
     wanted = {"runs": 2, "failed_runs": 0, "collision_rate": 50.0, "at_fault_collision_rate": 50.0}
     assert found.items() >= wanted.items()
     assert found["progress"] == pytest.approx((12 * 4 + 7 * 4) / 2, rel=1e-4)
     assert found["max_jerk"] == pytest.approx(0, abs=1e-3)
     assert [row["segment"] for row in found["per_run"]] == ["a&b <i>", "free"]
-    page = (tmp_path / "sim" / "report.html").read_text()
+    page = (sim / "report.html").read_text()
     # Two seconds before the first event, at 1.2 s, there was nothing yet.
     assert "view.html#segment=a%26b+%3Ci%3E&rollout=0&t=0&follow=ego" in page
     assert "<i>" not in page.split("<body>")[1].split("<script>")[0]
-    assert "src=" not in page
-    assert "http" not in page
-    assert (tmp_path / "sim" / "view.html").is_file()
-    assert main(["report", str(tmp_path / "sim"), "--no-view", "--out", str(tmp_path / "other")]) == 0
+    assert not re.search("src=|http", page)
+    assert (sim / "view.html").is_file()
+    assert main(["report", str(sim), "--no-view", "--out", str(tmp_path / "other")]) == 0
     assert sorted(p.name for p in (tmp_path / "other").iterdir()) == [
         "report.csv",
         "report.html",

@@ -55,7 +55,7 @@ def _stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., 
     return make
 
 
-SHORT = ("--rollouts", "1", "--duration", "1", "--search", "none")
+SHORT = ("--segments", "0", "--rollouts", "1", "--duration", "1", "--search", "none")
 SETTINGS = ("agent__encoder", "agent__policy", "discriminator__network", "search__rule")
 
 
@@ -79,15 +79,12 @@ def test_trusted_code_is_named_and_runs(stranger: Callable[..., Path], capsys: A
     ):
         assert load_agent(str(folder), trust_code=True).policy is not None
     assert Path("ran").exists()
-    data = ["--data", str(builtin_store("test"))]
-    for command in (
-        ["simulate", str(folder), *data, "--out", "sim", "--segments", "0", *SHORT],
-        ["evaluate", str(folder), *data, "--segments", "0", *SHORT],
-        ["wosac", "evaluate", str(folder), *data],
-    ):
+    data = ("--data", str(builtin_store("test")))
+    for words, more in (("simulate", [*SHORT, "--out", "sim"]), ("evaluate", SHORT), ("wosac evaluate", ())):
+        command = [*words.split(), str(folder), *data, *more]
         assert main(command) == 1, command
         assert "names code" in capsys.readouterr().err, command
-        if command[0] in ("simulate", "evaluate"):
+        if more:
             assert main([*command, "--trust-code"]) == 0
             assert "runs code, 'stranger/notes.py:Encoder'" in capsys.readouterr().err
 
@@ -103,20 +100,16 @@ def test_the_current_folder_is_not_searched_for_it(stranger: Callable[..., Path]
     assert sys.path == before
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"agent__hidden": 60_000, "agent__head": 120_000},
-        {"agent__hidden": 60_000_000, "agent__head": 120_000_000},
-        {"agent__hidden": 2**62, "agent__head": 2**63},
-        {"agent__accelerations": 10**9 + 1},
-        {"action_space": "displacement", "agent__cells": 10**9 + 1},
-        {"discriminator__hidden": 10**9, "discriminator__head": 2 * 10**9},
-        {"agent__num_points": 10**9},
-        {"agent__num_lights": 10**9},
-        {"search__test_branches": 10**9},
-    ],
-)
+LARGE: list[dict[str, Any]] = [
+    *({"agent__hidden": n, "agent__head": 2 * n} for n in (60_000, 60_000_000, 2**62)),
+    {"agent__accelerations": 10**9 + 1},
+    {"action_space": "displacement", "agent__cells": 10**9 + 1},
+    {"discriminator__hidden": 10**9, "discriminator__head": 2 * 10**9},
+    *({name: 10**9} for name in ("agent__num_points", "agent__num_lights", "search__test_branches")),
+]
+
+
+@pytest.mark.parametrize("settings", LARGE)
 def test_networks_are_no_larger_than_their_weights(stranger: Callable[..., Path], settings: Any) -> None:
     with pytest.raises(SymphonyError, match=r"asks for a network|at most|no networks of these sizes"):
         load_agent(str(stranger(**settings)))

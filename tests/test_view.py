@@ -140,9 +140,6 @@ def test_a_film_needs_its_encoder(tmp_path: Path, capsys: Any, monkeypatch: pyte
     assert film.read_bytes()[4:8] == b"ftyp"
 
 
-# In a browser.
-
-
 @lru_cache
 def chromium() -> str:
     found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
