@@ -18,10 +18,9 @@ from hypothesis.extra import numpy as arrays
 from fuzz_mutations import bytes_
 from helpers_scenarionet import FAR, STEPS, line, ring, scenario, track, write
 from helpers_sources import off_road, read_error, read_one
-from symphony.data.conformance import check_reader
 from symphony.data.convert import convert
 from symphony.data.segment import AgentType, LaneType, MarkType, SignalState
-from symphony.data.sources import get_reader, safe_pickle
+from symphony.data.sources import safe_pickle
 from symphony.data.sources.safe_pickle import Array, load_plain
 from symphony.data.store import SegmentStore
 from symphony.errors import DataError
@@ -218,16 +217,6 @@ def test_names_that_can_not_be_written_end_no_conversion(key: str, tmp_path: Pat
     assert (report.converted, report.files) == (1, 2)
     (skipped,) = SegmentStore(tmp_path / "out").report["skipped"]
     assert "\\ud800" in skipped["segment"] + skipped["field"]
-
-
-@pytest.mark.samples
-def test_samples(samples: Path) -> None:
-    files = sorted((samples / "real" / "scenarionet").glob("*.pkl"))[:4]
-    if not files:
-        pytest.skip("the ScenarioNet samples are not among the samples")
-    report = check_reader(get_reader("scenarionet"), files)
-    assert report.segments == len(files)
-    assert report.numbers["off_road"] < 0.03
 
 
 PROTOCOLS = range(4, pickle.HIGHEST_PROTOCOL + 1)
