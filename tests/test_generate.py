@@ -152,7 +152,7 @@ def test_networks_in_vain_come_to_an_end(tmp_path: Path, monkeypatch: pytest.Mon
 def test_a_killed_run_is_continued(tmp_path: Path) -> None:
     out = tmp_path / "killed"
     what = f"data generate --count 10 --seed 11 --out {out}".split()
-    command = [sys.executable, "-m", "symphony.cli", *what]
+    command = [sys.executable, "-m", "symphony", *what]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         index = out / "segments.idx"

@@ -30,7 +30,7 @@ from helpers_sources import ROAD, commonroad, driver, obstacle, state, womd_scen
 from helpers_wosac import record_rollouts, womd_record
 from symphony.agents.agent import Best
 from symphony.agents.checkpoint import MANIFEST, checkpoints, load_checkpoint, save_checkpoint
-from symphony.cli.view import write_view
+from symphony.cli.rollouts import write_view
 from symphony.config import AgentSpec, DiscriminatorConfig, TrainConfig, read_json, to_json
 from symphony.data.convert import info
 from symphony.data.parts import Preparation

@@ -1,7 +1,6 @@
 """The ``symphony`` command: what it offers, and how it ends.
 
-Modules of this package import nothing heavy at the top, so that ``--help`` answers at once; each command imports
-what it needs when it runs. A command is a class with the name of its module; modules of `GROUPS` have several.
+Nothing heavy is imported at the top, so that ``--help`` answers at once; each command imports what it needs.
 """
 
 from __future__ import annotations
@@ -13,30 +12,20 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, get_type_hints
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import tyro
 
-from symphony import __version__, allocator
-from symphony.cli.shared import Command, Result, warn
-from symphony.config.checks import Bounds
+from symphony import __version__, allocator, errors
+from symphony.cli.shared import Command, Result, tell
+from symphony.config.checks import Bounds, type_hints
 from symphony.config.profiles import expanded
-from symphony.errors import (
-    AllFailedError,
-    ConfigError,
-    CouldNotRunError,
-    DataWarning,
-    SymphonyError,
-    printable,
-)
 from symphony.files import lock_file
 
 __all__ = ["main"]
 
-FAILED, USAGE, ALL_FAILED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 143
-"""Statuses that commands end with, beside 0."""
-
+FAILED, USAGE, ALL_FAILED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 143  # how commands end, beside 0
 GONE = {
     "evaluate --wosac-config": "`symphony wosac evaluate` takes the year as --config",
     "data info --routes": "`symphony plot routes` draws them",
@@ -61,47 +50,47 @@ DESCRIPTION = """Realistic and diverse traffic agents learned from logged drivin
 Every command explains itself, as in `symphony data convert --help`. The version: `symphony --version`. With
 SYMPHONY_DEBUG=1 in the environment, errors come with their traceback. Exit status: 0 done, 1 failed, 2 wrong usage,
 3 every simulated run failed."""
-COMMANDS = (
-    "data train evaluate table plot simulate view report export planners test hunt wosac agents demo doctor"
-)
-GROUPS = ("data", "plot", "wosac")
-"""Those that have commands of their own."""
+COMMANDS = """data agents.train agents.evaluate agents.table plot rollouts.simulate rollouts.view rollouts.report
+rollouts.export planners.planners planners.test planners.hunt wosac agents.agents agents.demo agents.doctor"""
+"""Commands by the modules they are in, in the order of the help; a module alone is a group of commands."""
 
 app = tyro.extras.SubcommandApp()
-for _name in COMMANDS.split():
-    _module = importlib.import_module(f"symphony.cli.{_name}")
-    if _name in GROUPS:
-        _group = app.command(tyro.extras.SubcommandApp(), name=_name, help=_module.__doc__)
-        for _class in Command.__subclasses__():
-            if _class.__module__ == _module.__name__:
-                _group.command(name=_class.__name__.lower())(_class)
+for _module, _, _name in (_place.partition(".") for _place in COMMANDS.split()):
+    _found = importlib.import_module(f"symphony.cli.{_module}")
+    if _name:
+        app.command(name=_name)(getattr(_found, _name.capitalize()))
     else:
-        app.command(name=_name)(getattr(_module, _name.capitalize()))
+        _group = app.command(tyro.extras.SubcommandApp(), name=_module, help=_found.__doc__)
+        for _class in Command.__subclasses__():
+            if _class.__module__ == _found.__name__:
+                _group.command(name=_class.__name__.lower())(_class)
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line, by default with the arguments of the process, and return the exit status."""
     if args is None:
         settle()
-        args = sys.argv[1:]
-    args = list(args)
+    args = list(sys.argv[1:] if args is None else args)
     if args == ["--version"]:
         return guarded(lambda: print(f"symphony {__version__}"))  # noqa: T201
     try:
         for gone, instead in GONE.items():
             *command, last = gone.split()
             if args[: len(command)] == command and last in args:
-                raise ConfigError(f"`symphony {gone}` is gone: {instead}")
+                raise errors.ConfigError(f"`symphony {gone}` is gone: {instead}")
         chosen = app.cli(
             prog="symphony",
             description=DESCRIPTION,
             args=expanded(args) if args[:1] == ["train"] else args,
             config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
         )
-        for name, value, bounds in _marked(chosen, Bounds):
-            if (len(value) if isinstance(value, tuple) else value) < bounds.least:
-                raise ConfigError(f"--{name.replace('_', '-')}: give at least {bounds.least}")
-    except ConfigError as error:
+        hints = type_hints(chosen.__class__).items()
+        marks = {name: getattr(hint, "__metadata__", ()) for name, hint in hints}
+        marked = [(name, getattr(chosen, name), mark) for name in marks for mark in marks[name]]
+        for name, value, mark in marked:
+            if isinstance(mark, Bounds) and (len(value) if isinstance(value, tuple) else value) < mark.least:
+                raise errors.ConfigError(f"--{name.replace('_', '-')}: give at least {mark.least}")
+    except errors.ConfigError as error:
         return _complain(error, USAGE)
     except SystemExit as stop:
         # Help or a complaint was printed; whoever read it may have gone, say `head`.
@@ -109,20 +98,12 @@ def main(args: Sequence[str] | None = None) -> int:
 
     def run() -> None:
         with contextlib.ExitStack() as held:
-            for _, path, _ in _marked(chosen, Result):
-                if path is not None and str(path) != "-":  # tried and locked before the work
+            for _, path, mark in marked:  # tried and locked before the work
+                if isinstance(mark, Result) and path is not None and str(path) != "-":
                     held.enter_context(lock_file(path))
             chosen()
 
     return guarded(run)
-
-
-def _marked(command: Any, mark: type) -> Iterator[tuple[str, Any, Any]]:
-    """Name, value and mark of the options whose types have a mark of a kind."""
-    for name, hint in get_type_hints(type(command), include_extras=True).items():
-        for extra in getattr(hint, "__metadata__", ()):
-            if isinstance(extra, mark):
-                yield name, getattr(command, name), extra
 
 
 def settle() -> None:
@@ -146,10 +127,9 @@ def guarded(action: Callable[[], object]) -> int:
         return FAILED
     except KeyboardInterrupt as stop:
         return _complain(str(stop) or "interrupted", TERMINATED if str(stop) else INTERRUPTED)
-    except CouldNotRunError as error:
-        return _complain(error, USAGE)
-    except (SymphonyError, OSError) as error:
-        return _complain(error, ALL_FAILED if isinstance(error, AllFailedError) else FAILED)
+    except (errors.SymphonyError, OSError) as error:
+        usage, failed = isinstance(error, errors.CouldNotRunError), isinstance(error, errors.AllFailedError)
+        return _complain(error, USAGE if usage else ALL_FAILED if failed else FAILED)
     finally:
         if ours:
             signal.signal(signal.SIGTERM, before)
@@ -164,8 +144,8 @@ def _terminate(number: int, frame: object) -> None:
 
 def _warn(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
     """Show our warnings in one line, those of libraries as they are."""
-    if issubclass(category, DataWarning):
-        warn(str(message))
+    if issubclass(category, errors.DataWarning):
+        tell(f"symphony: warning: {message}")
     else:
         sys.stderr.write(warnings.formatwarning(message, category, *place[:2]))
 
@@ -175,6 +155,5 @@ def _complain(error: object, status: int) -> int:
         raise error
     if isinstance(error, OSError) and error.strerror:
         error = f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
-    text = printable(str(error), keep="\n")
-    sys.stderr.write(f"symphony: error: {text}\n")
+    sys.stderr.write("symphony: error: " + errors.printable(f"{error}\n", keep="\n"))
     return status

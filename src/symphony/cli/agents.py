@@ -1,12 +1,158 @@
-"""Say which agents come with the package."""
+"""Learn agents, evaluate them against the log, build the paper's tables from that; the included agents, a demo."""
 
 from __future__ import annotations
 
-from typing import Annotated
+import os
+import platform
+import shutil
+import sys
+import time
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+import symphony
+from symphony import files, render
 from symphony.cli import shared
+from symphony.config import AgentConfig, PaperData, PerturbConfig, Setting, TableFormat, WosacSettings
+from symphony.config.profiles import WORDS, Profile
+
+PANELS, SHOWN, NAMED = 6, 8, 5
+"""Run segments in one picture, rollouts that are drawn of each, runs left out for one reason that are named."""
+BASELINES = {"log playback": "playback", "constant velocity": "constant_velocity"}
+"""Agents of the demo by their titles, of which only the numbers are shown."""
+PACKAGES = "torch torchrl tensordict numpy shapely matplotlib wandb safetensors"
+EXTRAS = "eclipse-sumo pyarrow ray imageio-ffmpeg gymnasium"
+
+
+class Train(shared.Command):
+    """Learn agents from a store of run segments."""
+
+    config: Annotated[symphony.TrainConfig, arg(name="")]
+    profile: Annotated[Profile, arg(help=WORDS)] = "default"
+
+    def __call__(self) -> None:
+        folder = symphony.train(self.config)
+        if os.environ.get("RANK", "0") == "0":  # of the processes that torchrun starts, one speaks
+            shared.say("\n".join(last_words(folder, self.config)))
+
+
+def last_words(folder: Path, config: symphony.TrainConfig) -> list[str]:
+    """Which checkpoint of a run is its agent and how good it is, and what to do next."""
+    from symphony.agents.agent import best_of, choose
+
+    score = "the last one; nothing was validated, see --validation.data"
+    if (best := best_of(choose(folder, "last"))) is not None:
+        data = f"segments of {config.validation.data} (at most {config.validation.segments})"
+        score = f"the best one, with collision rate plus off-road time of {best.infractions:.2f} % on {data}"
+    return [
+        f"trained agent  {folder}",
+        f"checkpoint     {choose(folder).name}: {score}",
+        f"curves         symphony plot curves {folder} --out curves.png",
+        f"evaluate it    symphony evaluate {folder} --data DIR",
+    ]
+
+
+class Evaluate(shared.Simulation):
+    """Simulate the interactive agents of every run segment and compare them with the log.
+
+    The log itself and agents at constant velocity are evaluated beside the agent. A run keeps what was found in its
+    folder, as evaluations/NAME.json, where `symphony table` looks for it; the same evaluation made again replaces it.
+    With --segments the folder of a run is left as it is.
+    """
+
+    json: shared.Json = None
+    figure: shared.ResultFile = None  # Picture (.png, .pdf or .svg) or animation (.gif) of some rollouts.
+    #: Folder for the rollouts that are evaluated (see `symphony view`, `report` and `export`).
+    save_rollouts: shared.Folder = None
+    #: Print every number of each agent, not only the table: kinds of collision, what the divergence owes to sampling,
+    #: where agents stand at the end, what a search made of the goals, and what becomes of single agents.
+    details: bool = False
+    keep: bool = True  # Leave the folder of the run as it is.
+    #: More scores for the record and `symphony table`: `wosac` (2025), 32 rollouts of everyone (see docs/wosac.md).
+    metrics: tuple[Literal["wosac"], ...] = ()
+
+    def __call__(self) -> None:
+        from symphony.evaluation.records import evaluation_record, keep_evaluation
+        from symphony.learning.demonstrations import evenly_spaced
+        from symphony.saved import folder, saving
+
+        if self.figure is not None:
+            from symphony.render.style import ANIMATIONS, FORMATS, picture_path
+
+            picture_path(self.figure, (*FORMATS, *ANIMATIONS))
+        agent = symphony.load_agent(self.agent, self.config.device, trust_code=self.trust_code)
+        store, config = symphony.SegmentStore(self.data), self.config
+        chosen = shared.segment_indices(store, self.segments)
+        if self.metrics:
+            from symphony.wosac.evaluate import evaluate_wosac, scorable, wosac_parts
+            from symphony.wosac.table import wosac_table
+
+            rows, settings = chosen or range(len(store)), WosacSettings.of(config)
+            scorable(store, rows, settings.future)  # complains now, not after the work
+        shown = [] if self.figure is None else evenly_spaced(len(chosen or store), PANELS)
+        clips: list[render.Clip] = []
+        writer: folder.RolloutWriter | None = None
+        if self.save_rollouts is not None:
+            plain = saving.plain_settings(config, agent, agent.interactive, agent.duration)
+            about = folder.About.of(agent.name, store, plain, seed=config.seed)
+            writer = folder.RolloutWriter(self.save_rollouts, about)
+
+        def observe(item: int, saved: Any) -> None:
+            if item in shown:
+                name = f"{shared.short_name(agent.name)}: {saved.segment.segment_id}"
+                clips.append(render.saved_clip(saved, SHOWN, name))
+            if writer is not None and not writer.has(saved.segment.segment_id):
+                writer.add(saved)
+
+        how: dict[str, Any] = {"observe": observe} if shown or writer is not None else {}
+        how |= {"items": chosen or None, "baselines": True}
+        with shared.progress(f"evaluating {agent.name}") as advance:
+            found = symphony.evaluate(agent, store, config, advance, **how)
+        record = evaluation_record(agent, found, store)
+        if self.metrics:
+            with shared.progress(f"WOSAC score of {agent.name}") as advance:
+                scored = evaluate_wosac(agent, store, rows, settings, progress=advance)
+            record |= wosac_parts(scored, record)
+        if shared.write_numbers(self.json, record):
+            others = [one.numbers() for one in found.baselines if one.agent != found.agent]
+            shared.print_metrics([*others, found.numbers()], str(self.data), details=self.details)
+            if self.metrics:
+                sys.stdout.write(wosac_table([scored.record()]))
+        if self.keep and not chosen:
+            keep_evaluation(agent.name, record)
+        if self.figure is not None:
+            render.draw_clips(clips, self.figure)
+
+
+class Table(shared.Command):
+    """Build one of the paper's tables from runs that `symphony evaluate` (or a recipe) has evaluated.
+
+    A row for each method there is (and each way that it was simulated in), mean and standard error over its seeds,
+    the best of the BC methods and of the MGAIL methods in bold. Runs of other settings are left out.
+    """
+
+    #: Setting of the table. `main`: 10 s, 2 interactive agents; `long`: 20 s; `many`: 8 interactive agents.
+    setting: Setting
+    runs: Annotated[shared.Paths, arg(metavar="DIR ...")] = ()  # Folders of runs, or folders that hold some.
+    #: Names of the evaluations of a run that count, where it keeps several (in its folder `evaluations`); * and ?
+    #: stand for anything. Of several names, the first that fits any decides.
+    evaluation: shared.Names = ()
+    paper: PaperData | None = None  # Data set on which the paper's own figures are shown beside ours.
+    format: TableFormat = "markdown"  # Format of the table.
+    out: shared.ResultFile = None  # File to write the table to; otherwise it is printed.
+
+    def __call__(self) -> None:
+        from symphony.evaluation.table import collect, compare, table_text
+
+        entries, left_out = collect(self.runs, self.setting, self.evaluation)
+        for reason, folders in left_out.items():
+            more = f" and {len(folders) - NAMED} more" if len(folders) > NAMED else ""
+            shared.tell(f"left out, {reason}: {', '.join(map(str, folders[:NAMED]))}{more}")
+        table = compare(entries, self.setting, self.paper)
+        shared.write_text(self.out, files.json_text(table) if self.format == "json" else table_text(table))
 
 
 class Agents(shared.Command):
@@ -23,3 +169,89 @@ class Agents(shared.Command):
         folders = [pretrained_folder(name) for name in names]
         if shared.write_numbers(self.json, {"agents": [read_card(folder) for folder in folders]}):
             shared.say("\n\n".join((folder / "README.md").read_text(encoding="utf-8") for folder in folders))
+
+
+class Demo(shared.Command):
+    """Evaluate and draw an agent that comes with the package, on the built-in data: half a minute on a laptop.
+
+    Then learn another from the built-in data, some minutes, and show it beside the first.
+    """
+
+    #: Folder for the trained agent, the pictures and the numbers; an earlier demo there is replaced.
+    out: Path = Path("out/demo")
+    steps: int = 1500  # Updates of the agent that is learned.
+    rollouts: int = 16  # Rollouts per run segment in the evaluation.
+    seed: int = 0  # Seed of the training and of the rollouts.
+
+    def __call__(self) -> None:
+        with shared.locked_folder(self.out, "demo.lock"):
+            self._show_all()
+
+    def _show_all(self) -> None:
+        from symphony.learning.demonstrations import evenly_spaced
+
+        began, run, numbers = time.perf_counter(), self.out / "bc_h", self.out / "metrics.json"
+        test = symphony.builtin_store("test")
+        settings = symphony.EvaluateConfig(rollouts=self.rollouts, seed=self.seed)
+        items = evenly_spaced(len(symphony.SegmentStore(test)), 3)
+        rows: list[dict[str, Any]] = []
+        clips: list[render.Clip] = []
+
+        def show(agents: dict[str, str], picture: Path) -> None:
+            """Evaluate agents by their titles, and show them beside those before."""
+            for title, agent in agents.items():
+                kept: dict[int, Any] = {}
+                with shared.progress(f"evaluating {title}") as advance:
+                    found = symphony.evaluate(agent, test, settings, advance, observe=kept.__setitem__)
+                rows.append({**found.numbers(), "agent": title})
+                for saved in [] if title in BASELINES else map(kept.__getitem__, items):
+                    clips.append(render.saved_clip(saved, SHOWN, f"{title}: {saved.segment.segment_id}"))
+            shared.print_metrics(rows, "Built-in test segments")
+            files.write_json(numbers, {"rows": rows, "seconds": round(time.perf_counter() - began, 1)})
+            render.draw_clips(clips, picture, columns=len(items))
+            shared.say(f"picture: {picture}")
+
+        shared.say("An included agent, on segments that it has not seen, with its search:")
+        show({**BASELINES, "included BC+TS+H": "pretrained:bc_ts_h"}, self.out / "included.png")
+        shared.say(f"\nNow one of your own: BC with goals (BC+H), {self.steps} updates, some minutes.")
+        if (run / "config.json").is_file():
+            shutil.rmtree(run)
+        # Cheaper updates than by default suit the few segments of the package; so do inputs beyond the paper's, and
+        # displaced states once the policy drives.
+        agent = AgentConfig(num_points=128, num_lights=4, features="gaps", accelerations=21)
+        perturb = PerturbConfig(share=0.5, begin=self.steps // 3)
+        more: dict[str, Any] = {"states": 512, "agent": agent, "perturb": perturb, "wandb": "disabled"}
+        more |= {"data": symphony.builtin_store("train"), "out": run, "steps": self.steps, "seed": self.seed}
+        symphony.train(symphony.TrainConfig(method="bc_h", **more))
+        show({"your BC+H": str(run)}, self.out / "rollouts.png")
+        shared.say(f"numbers: {numbers}\nagent:   {run}")
+        shared.say("next:    symphony test examples/suite.toml tests a planner")
+
+
+class Doctor(shared.Command):
+    """Say what is installed, and simulate a second with an agent that comes with the package."""
+
+    json: shared.Json = None
+
+    def __call__(self) -> None:
+        import torch
+
+        began, second = time.perf_counter(), symphony.EvaluateConfig(rollouts=2, branches=2, duration=1)
+        test = symphony.builtin_store("test")
+        numbers = symphony.evaluate("pretrained:bc_ts_h", test, second, items=[0]).numbers()
+        seconds = time.perf_counter() - began
+        devices = [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
+        found: dict[str, Any] = {
+            "symphony": {"version": symphony.__version__, "at": symphony.__file__},
+            "python": {"version": platform.python_version(), "at": sys.executable},
+            "system": {"kernel": platform.platform(), "cores": os.cpu_count(), "CUDA devices": devices},
+            "packages": {name: _installed(name) for name in PACKAGES.split()},
+            "extras": {name: _installed(name) for name in EXTRAS.split()},
+            "simulation": {"rollouts": numbers["rollouts"], "seconds": seconds, "ADE": numbers["ade"]},
+        }
+        if shared.write_numbers(self.json, found):
+            shared.print_facts(found)
+
+
+def _installed(package: str) -> str:
+    return next((found.version for found in distributions(name=package)), "not installed")

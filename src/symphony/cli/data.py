@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -14,11 +14,8 @@ from symphony.cli import shared
 from symphony.config.checks import Count, Natural
 from symphony.errors import ConfigError
 
-if TYPE_CHECKING:
-    from symphony.data.generate import Plan
-
-READER_OPTIONS = {"commonroad": ("egos",), "interaction": ("egos", "window", "stride", "motion")}
-"""Options of `data convert` that only some readers take."""
+READER_OPTIONS = {"interaction": ("egos", "window", "stride", "motion"), "commonroad": ("egos",)}
+"""Options of `data convert` that only some readers take; the first takes all of them."""
 LISTS = {"path", "files", "settings", "reasons", "odd_examples", "skipped", "skipped_details"}
 """What `data info` tells in its JSON alone."""
 
@@ -54,44 +51,40 @@ class Generate(shared.Command):
             raise ConfigError(f"--preset decides --{min(own)} itself: give one or the other")
         self._plans()
 
-    def _plans(self) -> list[tuple[str, Plan, Path]]:
-        """The stores to make: their split, plan and folder."""
+    def _plans(self) -> list[Any]:
         from symphony.data.generate import PRESETS, Plan
 
         if self.preset is not None:
-            return [(split, plan, self.out / split) for split, plan in PRESETS[self.preset].plans.items()]
-        kinds = tuple(kind.strip() for kind in self.kinds.split(","))
-        plan = Plan(self.count or 0, self.seed, self.split, kinds, self.duration, self.interactive)
-        return [(self.split, plan, self.out)]
+            return list(PRESETS[self.preset].plans.values())
+        kinds = tuple(map(str.strip, self.kinds.split(",")))
+        return [Plan(self.count or 0, self.seed, self.split, kinds, self.duration, self.interactive)]
 
     def __call__(self) -> None:
         from symphony.data.generate import MADE_WITH, PRESETS
         from symphony.data.sources.sumo import sumo_version
 
         expected: dict[Any, str] = {} if self.preset is None else dict(PRESETS[self.preset].checksums)
-        found = [self._make(*made, expected.get(made[0])) for made in self._plans()]
-        stores = {one["split"]: one for one in found}
-        if shared.write_numbers(self.json, {"preset": self.preset, "stores": stores}):
-            for one in found:
+        found = {plan.split: self._make(plan, expected.get(plan.split)) for plan in self._plans()}
+        told = shared.write_numbers(self.json, {"preset": self.preset, "stores": found})
+        for one in found.values():
+            if told:
                 shared.print_facts(one)
-        for one in found:
             if one["expected_checksum"] not in (None, one["checksum"]):
-                text = "the checksum is not that of the standard set, which was made with"
-                shared.warn(f"{one['path']}: {text} {MADE_WITH}; yours was made with SUMO {sumo_version()}")
+                text = f"symphony: warning: {one['path']}: the checksum is not that of the standard set, which was"
+                shared.tell(f"{text} made with {MADE_WITH}; yours was made with SUMO {sumo_version()}")
 
-    def _make(self, split: str, plan: Plan, path: Path, expected: str | None) -> dict[str, Any]:
+    def _make(self, plan: Any, expected: str | None) -> dict[str, Any]:
         from symphony.data.generate import generate
 
-        with shared.progress(f"generating {split}") as advance:
-
-            def show(done: int, state: Any) -> None:
-                advance(done, plan.segments, f"from {state.networks} networks")
-
-            made = generate(plan, path, workers=self.workers, engine=self.engine, progress=show)
+        path = self.out if self.preset is None else self.out / plan.split
+        how: dict[str, Any] = {"workers": self.workers, "engine": self.engine}
+        with shared.progress(f"generating {plan.split}") as advance:
+            how["progress"] = lambda done, at: advance(done, plan.segments, f"from {at.networks} networks")
+            made = asdict(generate(plan, path, **how))
         store = symphony.SegmentStore(path)
-        found = {"split": split, "path": str(path), "segments": len(store), "checksum": store.checksum()}
-        found |= {"expected_checksum": expected, "settings": store.report["settings"]}
-        return found | {"generation": asdict(made)}
+        found = {"split": plan.split, "path": str(path), "segments": len(store), "checksum": store.checksum()}
+        more = {"expected_checksum": expected, "settings": store.report["settings"], "generation": made}
+        return found | more
 
 
 class Quality(shared.Command):
@@ -104,8 +97,8 @@ class Quality(shared.Command):
     def __call__(self) -> None:
         from symphony.evaluation.logs import measure, shortfalls
 
+        store = symphony.SegmentStore(self.store)
         with shared.progress("measuring") as advance:
-            store = symphony.SegmentStore(self.store)
             quality = measure(store, interactive=self.interactive, progress=advance)
         if shared.write_numbers(self.json, quality):
             shared.print_facts(quality, str(self.store))
@@ -128,8 +121,8 @@ class Hardest(shared.Command):
     def __call__(self) -> None:
         from symphony.bench.criticality import hardest
 
+        store = symphony.SegmentStore(self.store)
         with shared.progress("looking at the log") as advance:
-            store = symphony.SegmentStore(self.store)
             found = [one for _, one in hardest(store, self.count, progress=advance)]
         told = shared.write_numbers(self.json, [{**asdict(one), "score": one.score} for one in found])
         if self.ids:
@@ -169,39 +162,32 @@ class Convert(shared.Command):
     motion: Literal["logged", "positions"] = "logged"
     #: Metres from the ego's path within which map and agents are kept: for sources of whole districts (ScenarioNet).
     radius: float | None = None
-    #: Leave out run segments in whose log a moving vehicle's box overlaps another box.
-    exclude_overlaps: bool = False
+    exclude_overlaps: bool = False  # Leave out run segments in which a moving vehicle's box overlaps another.
     #: Give lights their last known state (before it: the first) where the log knows none (see docs/formats.md).
     hold_lights: bool = False
-    #: Skip a record of which something odd would be left out, such as an agent without a size.
-    strict: bool = False
+    strict: bool = False  # Skip a record of which something odd would be left out (an agent without a size).
     workers: shared.Workers = 1
     engine: shared.EngineName = "local"
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            wrong = f.name in READER_OPTIONS["interaction"] and f.name not in READER_OPTIONS.get(
-                self.format, ""
-            )
-            if wrong and getattr(self, f.name) != f.default:
-                raise ConfigError(f"--{f.name} is not for {self.format}")
+        given = {f.name for f in fields(self) if getattr(self, f.name) != f.default}
+        if wrong := given & {*READER_OPTIONS["interaction"]} - {*READER_OPTIONS.get(self.format, ())}:
+            raise ConfigError(f"--{min(wrong)} is not for {self.format}")
 
     def __call__(self) -> None:
         from symphony.data.convert import convert
 
-        settings = {f.name: getattr(self, f.name) for f in fields(self)}
-        reader, files, out = (settings.pop(name) for name in ("format", "files", "out"))
-        options = {name: settings.pop(name) for name in READER_OPTIONS["interaction"]}
-        settings["reader_options"] = {name: options[name] for name in READER_OPTIONS.get(reader, ())}
+        given = dict(vars(self))
+        reader, files, out = (given.pop(name) for name in ("format", "files", "out"))
+        options = {name: given.pop(name) for name in READER_OPTIONS["interaction"]}
+        given["reader_options"] = {name: options[name] for name in READER_OPTIONS.get(reader, ())}
         with shared.progress("converting", "files") as advance:
-
-            def show(done: int, total: int, so_far: Any) -> None:
-                advance(done, total, f"{so_far.converted} converted, {len(so_far.skipped)} skipped")
-
-            report = convert(reader, files, out, progress=show, **settings)
+            told = "{} converted, {} skipped".format
+            given["progress"] = lambda n, of, at: advance(n, of, told(at.converted, len(at.skipped)))
+            report = convert(reader, files, out, **given)
         Info(store=out, interactive=0)()
         if report.warning:
-            shared.warn(report.warning)
+            shared.tell(f"symphony: warning: {report.warning}")
 
 
 class Merge(shared.Command):
@@ -231,9 +217,9 @@ class Info(shared.Command):
         from symphony.data.convert import info
         from symphony.data.selection import choices
 
-        found, store = info(self.store), symphony.SegmentStore(self.store)
+        found = info(self.store)
         if self.interactive:
-            found["interactive"] = choices(store, self.interactive)
+            found["interactive"] = choices(symphony.SegmentStore(self.store), self.interactive)
         if shared.write_numbers(self.json, found):
             found.get("interactive", {}).pop("segments", None)
             facts = {name: value for name, value in found.items() if name not in LISTS}

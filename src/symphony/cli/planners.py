@@ -1,12 +1,20 @@
-"""Compare planners among crowds."""
+"""Compare planners among crowds, test them against thresholds, estimate how often they fail where that is rare."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+import symphony
+from symphony import errors, files
 from symphony.cli import shared
+from symphony.config import checks
+
+Several = Annotated[int, checks.Bounds(2)]
+Device = Annotated[str, arg(help="Device that simulates: `cpu`, `cuda` or `cuda:N`.")]
 
 
 class Planners(shared.Command):
@@ -29,3 +37,98 @@ class Planners(shared.Command):
         check_crowds(records)
         if shared.write_numbers(self.json, {"records": records}) or self.out is not None:
             shared.write_text(self.out, planners_text(records))
+
+
+class Test(shared.Command):
+    """Test planners among crowds against a suite of thresholds, such as collisions at fault in at most 1 % of runs.
+
+    The suite is a TOML file (see docs/test-bench.md and examples/suite.toml). The exit status is 0 if every threshold
+    is kept, 1 if one is not, and 2 if the suite could not run. An interrupted suite is continued by the same command.
+    """
+
+    suite: Annotated[Positional[Path], arg(metavar="SUITE")]  # File of the suite.
+    #: Folder of the results: index.html, result.json, junit.xml, and the rollouts of each planner and crowd.
+    out: Annotated[Path, arg(metavar="DIR")] = Path("out/test")
+    junit: shared.ResultFile = None  # File to write the JUnit XML to as well.
+    json: shared.Json = None
+    view: bool = True  # Leave the pages that play the rollouts unwritten.
+    workers: shared.Workers = 1
+    engine: shared.EngineName = "local"
+    device: Device = "cpu"
+
+    def __call__(self) -> None:
+        from symphony.bench.pages import junit, page, sentence
+        from symphony.bench.run import run_suite
+        from symphony.bench.suite import read_suite
+
+        index = self.out / "index.html"
+        try:
+            suite = read_suite(self.suite, workers=self.workers, engine=self.engine, device=self.device)
+            with shared.progress(suite.name, "runs") as advance:
+                result = run_suite(suite, self.out, lambda name, n, of: advance(n, of, name), view=self.view)
+            for file in (self.out / "junit.xml", self.junit):
+                if file is not None:
+                    files.write_file(file, junit(result))
+            files.write_file(index, page(result, view=self.view))
+            if shared.write_numbers(self.json, result.plain()):
+                for one in result.verdicts:
+                    shared.say(f"{one.status:8}{one.planner} among {one.crowd}: {sentence(one)}")
+                for run in result.regressions[:5]:  # all of them are in the files
+                    which = "segment {segment}, rollout {rollout}, seed {seed}: {what}".format_map(run)
+                    shared.say(f"worse than the baseline: {run['planner']} among {run['crowd']}, {which}")
+                shared.say(f"written: {index}")
+        except (errors.SymphonyError, OSError) as error:
+            raise errors.CouldNotRunError(str(error)) from error
+        if failing := sum(one.status != "passes" for one in result.verdicts):
+            raise errors.SymphonyError(
+                f"{failing} of {len(result.verdicts)} thresholds are not kept: see {index}"
+            )
+
+
+class Hunt(shared.Command):
+    """Hunt for rare failures of a planner among learned agents, and estimate how often they happen.
+
+    Traffic in which the ego comes near to a collision is simulated more often, and weighs less in turn, so that the
+    estimate has no bias. It is for these run segments; its error is one standard error over trees. Some runs that
+    show the failure are kept: see them with `symphony view`.
+    """
+
+    #: Learned agent that drives the others: folder of a run (see `symphony train`), or `pretrained:NAME`.
+    agent: Annotated[Positional[str], arg(metavar="RUN")]
+    planner: str  # Planner that drives the ego, one that can be copied, as for `symphony simulate`.
+    data: Path  # Store of run segments.
+    out: Path  # New folder of the runs that are kept.
+    metric: str = "at_fault_collision_rate"  # Rate to estimate, one that a suite of `symphony test` can hold.
+    segments: shared.Segments = ()
+    trees: Several = 8  # Independent trees of each run segment.
+    branches: Several = 32  # Branches of each tree.
+    interactive: checks.Natural = 0  # Agents that are driven, the ego included; 0: as the agent was trained.
+    duration: checks.Natural = 0  # Seconds that are simulated; 0: as many as the agent was trained with.
+    seed: int = 0  # Seed of everything that is drawn at random.
+    workers: shared.Workers = 1
+    engine: shared.EngineName = "local"
+    device: Device = "cpu"
+    json: shared.Json = None
+
+    def __call__(self) -> None:
+        from symphony.bench import rare
+        from symphony.bench.measures import MEASURES
+        from symphony.rollouts.crowd import crowd_dataset
+
+        rates = [name for name, measure in MEASURES.items() if measure.kind == "rate"]
+        if self.metric not in rates:
+            raise errors.ConfigError(f"metric is one of {', '.join(rates)}, not '{self.metric}'")
+        names = ("trees", "branches", "interactive", "duration", "seed", "workers", "engine", "device")
+        config = symphony.EvaluateConfig(**{name: getattr(self, name) for name in names}, rollouts=self.trees)
+        agent, store = symphony.load_agent(self.agent, self.device), symphony.SegmentStore(self.data)
+        chosen = shared.segment_indices(store, self.segments) or None
+        dataset = crowd_dataset(store, agent, config, chosen, routes=True)
+        with shared.progress("hunting") as advance:
+            found = rare.hunt(self.out, rare.Hunt(agent, dataset, config, self.planner, self.metric), advance)
+        if shared.write_numbers(self.json, [asdict(one) for one in found]):
+            rows = [["segment", f"{MEASURES[self.metric].text} %", "±", "runs kept"]]
+            for one in found:
+                numbers = (f"{100 * one.rate:.3g}", f"{100 * one.error:.2g}", str(one.shown))
+                rows.append([one.segment or f"all {len(found) - 1}", *numbers])
+            shared.print_table(rows, heads=1)
+            shared.say(f"runs that show it: symphony view {self.out}")

@@ -9,9 +9,9 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 import symphony
+from symphony import errors, render
 from symphony.cli import shared
 from symphony.config.checks import Count
-from symphony.errors import ConfigError
 
 Runs = Annotated[Positional[shared.Paths], arg(metavar="RUN ...", help="Folders of runs.")]
 
@@ -25,8 +25,7 @@ class Curvature(shared.Command):
 
     runs: Runs
     out: shared.Picture
-    #: Name of the evaluation of a run that counts, as in `symphony table`.
-    evaluation: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
+    evaluation: shared.Names = ()  # Name of the evaluation of a run that counts, as in `symphony table`.
 
     def __call__(self) -> None:
         import numpy as np
@@ -35,7 +34,6 @@ class Curvature(shared.Command):
         from symphony.evaluation.records import choose_evaluation, kept_evaluations, read_run
         from symphony.evaluation.table import method_name
         from symphony.metrics import jensen_shannon
-        from symphony.render import plot_curvature
 
         panels = {}
         for run in self.runs:
@@ -43,9 +41,9 @@ class Curvature(shared.Command):
             method = method_name(read_run(folder)["method"])
             held = choose_evaluation(folder, kept_evaluations(folder), self.evaluation)["curvature"]
             policy, log = (np.array(held[part], dtype=np.int64) for part in ("policy", "log"))
-            divergence = 1000 * float(jensen_shannon(policy, log))
-            panels[f"{method} ({run}): JSD {divergence:.2f} · 10⁻³"] = policy, log
-        plot_curvature(panels, self.out)
+            title = f"{method} ({run}): JSD {1000 * float(jensen_shannon(policy, log)):.2f} · 10⁻³"
+            panels[title] = policy, log
+        render.plot_curvature(panels, self.out)
 
 
 class Curves(shared.Command):
@@ -53,17 +51,14 @@ class Curves(shared.Command):
 
     runs: Runs
     out: shared.Picture
-    #: Names of the only metrics to draw; by default all there are.
-    metrics: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
-    #: Share of a run's records that a point of the smoothed line is averaged over; 0 for not smoothing.
-    window: float = 0.1
+    metrics: shared.Names = ()  # Names of the only metrics to draw; by default all there are.
+    window: float = 0.1  # Share of a run's records that a point is averaged over; 0 for not smoothing.
 
     def __call__(self) -> None:
-        from symphony.render import plot_curves
         from symphony.training.logging import read_metrics
 
         found = {str(folder): read_metrics(folder) for folder in self.runs}
-        plot_curves(found, self.out, metrics=self.metrics, window=self.window)
+        render.plot_curves(found, self.out, metrics=self.metrics, window=self.window)
 
 
 class Segment(shared.Command):
@@ -77,24 +72,25 @@ class Segment(shared.Command):
 
     def __call__(self) -> None:
         from symphony.data.selection import interactive_choice
-        from symphony.render import plot_segment
         from symphony.render.style import picture_path
 
         picture_path(self.out)
         store = symphony.SegmentStore(self.store)
         segment = store[shared.segment_indices(store, [self.segment])[0]]
         if not 0 <= self.step < segment.num_steps:
-            raise ConfigError(f"--step {self.step} is outside the {segment.num_steps} steps of the segment")
+            raise errors.ConfigError(
+                f"--step {self.step} is outside the {segment.num_steps} steps of the segment"
+            )
         choice = interactive_choice(segment, self.interactive)
         title = segment.segment_id + (f" ({choice.context})" if choice.context else "")
-        plot_segment(segment, self.out, step=self.step, interactive=choice.agents.tolist(), title=title)
+        agents = choice.agents.tolist()
+        render.plot_segment(segment, self.out, step=self.step, interactive=agents, title=title)
 
 
 class Routes(shared.Command):
     """Draw the feasible routes of agents on the map, and mark the one that each took.
 
-    A panel is drawn for each interactive agent of each run segment; by default of three run segments, spread evenly
-    over the store.
+    A panel for each interactive agent of each run segment; by default of three segments, spread over the store.
     """
 
     data: Path  # Store of run segments.
@@ -106,16 +102,14 @@ class Routes(shared.Command):
         from symphony.data.selection import interactive_choice
         from symphony.envs.routes import route_table
         from symphony.learning.demonstrations import evenly_spaced
-        from symphony.render import plot_grid, plot_routes
         from symphony.roadgraph import LaneGraph
 
-        store = symphony.SegmentStore(self.data)
-        panels = []
+        store, panels = symphony.SegmentStore(self.data), []
         for number in shared.segment_indices(store, self.segments) or evenly_spaced(len(store), 3):
             segment = store[number]
             graph = LaneGraph(segment.road)
             for agent in interactive_choice(segment, self.interactive, fewer=True).agents.tolist():
                 table = route_table(segment, graph, agent)
                 lines = [table.line(route) for route in range(len(table.count))]
-                panels.append(partial(plot_routes, segment, agent, lines, table.logged))
-        plot_grid(panels, self.out, columns=self.interactive if self.interactive > 1 else 3, size=6.0)
+                panels.append(partial(render.plot_routes, segment, agent, lines, table.logged))
+        render.plot_grid(panels, self.out, columns=self.interactive if self.interactive > 1 else 3, size=6.0)

@@ -5,19 +5,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import tyro
 
 import symphony
 from symphony.cli import guarded, settle
-from symphony.cli.evaluate import Evaluate
-from symphony.cli.train import Train
-from symphony.config import EvaluateConfig
+from symphony.cli.agents import Evaluate, Train
 from symphony.config.profiles import expanded
-
-if TYPE_CHECKING:
-    from symphony.recipes import Recipe
 
 
 class Arguments(Train):
@@ -27,7 +22,7 @@ class Arguments(Train):
     rollouts: int = 16  # Rollouts per run segment in the evaluation.
 
 
-def main(recipe: Recipe, description: str | None, args: Sequence[str] | None = None) -> None:
+def main(recipe: Any, description: str | None, args: Sequence[str] | None = None) -> None:
     """Run a recipe with command-line arguments; by default with those of the process, which it ends."""
     if args is None:
         settle()
@@ -37,6 +32,6 @@ def main(recipe: Recipe, description: str | None, args: Sequence[str] | None = N
     settings = tyro.cli(Arguments, description=description, args=expanded([recipe.__name__, *args]))
     symphony.SegmentStore(settings.test)  # complains now, not after the training
     folder, training = train(settings.config, recipe), settings.config
-    config = EvaluateConfig(rollouts=settings.rollouts, seed=training.seed, device=training.device)
+    config = symphony.EvaluateConfig(rollouts=settings.rollouts, seed=training.seed, device=training.device)
     # What its folder names is the user's own words of a moment ago.
     Evaluate(agent=str(folder), data=settings.test, trust_code=True, config=config)()

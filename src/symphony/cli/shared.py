@@ -8,26 +8,22 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, dataclass_transform
+from typing import Annotated, Any, dataclass_transform
 
 from tyro.conf import Positional, arg
 
-from symphony.config import EvaluateConfig
-from symphony.config.checks import Bounds, Count
-from symphony.config.evaluation import Engine
-from symphony.errors import AllFailedError, ConfigError, printable
-from symphony.files import Lock, json_text, naming, write_file, write_json
-
-if TYPE_CHECKING:
-    from symphony.data.store import SegmentStore
-    from symphony.saved.folder import RolloutFolder
+import symphony
+from symphony import errors, files
+from symphony.config import EvaluateConfig, checks, evaluation
 
 
 class Result(str):
     """Marks the option of a file that a command writes once everything is done."""
 
 
-Paths = Annotated[tuple[Path, ...], Bounds(1)]
+Paths = Annotated[tuple[Path, ...], checks.Bounds(1)]
+Names = Annotated[tuple[str, ...], arg(metavar="NAME ...")]
+Folder = Annotated[Path | None, arg(metavar="DIR")]
 ResultFile = Annotated[Path | None, Result(), arg(metavar="FILE")]
 _JSON = "File to write all numbers to as JSON; - for standard output, and nothing else there."
 Json = Annotated[Path | None, Result(), arg(metavar="FILE", help=_JSON)]
@@ -38,9 +34,9 @@ _SEGMENTS = "Ids of run segments, or their numbers in the store, to use no other
 Segments = Annotated[tuple[str, ...], arg(metavar="ID ...", help=_SEGMENTS)]
 _TRUST = "Run the code that the agent's folder names by import paths; without it such a folder is refused."
 TrustCode = Annotated[bool, arg(help=_TRUST)]
-Workers = Annotated[Count, arg(help="Number of processes; it changes the speed, not the results.")]
+Workers = Annotated[checks.Count, arg(help="Number of processes; it changes the speed, not the results.")]
 _ENGINE = "Engine that runs the processes: `local`, on this machine, or `ray`, on a Ray cluster."
-EngineName = Annotated[Engine, arg(help=_ENGINE)]
+EngineName = Annotated[evaluation.Engine, arg(help=_ENGINE)]
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
@@ -63,35 +59,22 @@ class Simulation(Command):
     config: Annotated[EvaluateConfig, arg(name="")] = field(default_factory=EvaluateConfig)
 
 
-def tell_failed(folder: RolloutFolder) -> None:
-    """Tell how many runs failed, and why the first of them did; AllFailedError if all did."""
-    why = [f"{saved.segment.segment_id}, {reason}" for saved in folder for reason in saved.failed.values()]
-    why += [f"{entry.segment}, {entry.failed}" for entry in folder.failures for _ in range(entry.rollouts)]
-    runs = sum(entry.rollouts for entry in [*folder.entries, *folder.failures])
-    if why and len(why) == runs:
-        raise AllFailedError(f"all {runs} runs failed, the first: {why[0]}")
-    if why:
-        tell(f"{len(why)} of {runs} runs failed, the first: {why[0]}")
-
-
-def segment_indices(store: SegmentStore, names: Sequence[str]) -> list[int]:
-    """The places in a store of some run segments, each named once by its id or its number, or ConfigError."""
+def segment_indices(store: symphony.SegmentStore, names: Sequence[str]) -> list[int]:
+    """The places in a store of some run segments, each named once by its id or its number, or an error."""
     found: dict[int, str] = {}
     for name in names:
         place = store.index_of(int(name) if name not in store.ids and name.isdecimal() else name)
         if place in found:
-            raise ConfigError(f"segment {store.ids[place]} is named twice: {found[place]}, {name}")
+            raise errors.ConfigError(f"segment {store.ids[place]} is named twice: {found[place]}, {name}")
         found[place] = name
     return list(found)
 
 
-@contextmanager
-def locked_folder(path: Path, name: str) -> Iterator[None]:
+def locked_folder(path: Path, name: str) -> files.Lock:
     """Make a folder, and keep other writers out of it by a file of that name."""
-    with naming(path):
+    with files.naming(path):
         path.mkdir(parents=True, exist_ok=True)
-    with Lock(path / name):
-        yield
+    return files.Lock(path / name)
 
 
 @contextmanager
@@ -113,25 +96,20 @@ def progress(description: str, unit: str = "segments") -> Iterator[Callable[...,
 
 def say(text: str) -> None:
     """Print lines on standard output, with what a terminal would act on escaped."""
-    print(printable(text, keep="\n"))  # noqa: T201
+    print(errors.printable(text, keep="\n"))  # noqa: T201
 
 
 def tell(text: str) -> None:
     """Print a line beside the results, on standard error."""
-    sys.stderr.write(f"{printable(text)}\n")
-
-
-def warn(text: str) -> None:
-    """Print a warning on standard error."""
-    tell(f"symphony: warning: {text}")
+    sys.stderr.write(f"{errors.printable(text)}\n")
 
 
 def write_numbers(path: Path | None, numbers: Any) -> bool:
     """Write numbers as JSON to a file, or to standard output where it is called -; otherwise True: print a text."""
     if str(path) == "-":
-        sys.stdout.write(json_text(numbers))
+        sys.stdout.write(files.json_text(numbers))
     elif path is not None:
-        write_json(path, numbers)
+        files.write_json(path, numbers)
     return str(path) != "-"
 
 
@@ -140,17 +118,17 @@ def write_text(path: Path | None, text: str) -> None:
     if path is None:
         sys.stdout.write(text)
     else:
-        write_file(path, text)
+        files.write_file(path, text)
 
 
 def print_table(rows: Sequence[Sequence[str]], title: str = "", *, heads: int = 0) -> None:
     """Print rows of cells in columns, the first one flush left, with a rule below those that are headings."""
-    shown = [[printable(cell) for cell in row] for row in rows]
+    shown = [[errors.printable(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*shown, strict=True)]
     forms = [f"{{:{'>' if k else '<'}{width}}}" for k, width in enumerate(widths)]
     lines = ["  ".join(map(str.format, forms, row)) for row in shown]
-    rule = ["-" * max(map(len, lines))] if heads else []
-    say("\n".join([title] * bool(title) + lines[:heads] + rule + lines[heads:]))
+    lines[heads:heads] = ["-" * max(map(len, lines))] * bool(heads)
+    say("\n".join([title] * bool(title) + lines))
 
 
 def print_facts(found: Mapping[str, Any], title: str = "") -> None:
@@ -162,7 +140,7 @@ def print_facts(found: Mapping[str, Any], title: str = "") -> None:
 
 def _rows(found: Mapping[str, Any], indent: str = "") -> Iterator[tuple[str, str]]:
     for key, value in found.items():
-        name = indent + printable(str(key).replace("_", " "))
+        name = indent + errors.printable(str(key).replace("_", " "))
         if isinstance(value, Mapping) and {"mean", "max"} <= value.keys():
             yield name, ", ".join(f"{part} {_number(number)}" for part, number in value.items())
         elif isinstance(value, Mapping) and value:
@@ -176,23 +154,20 @@ def _rows(found: Mapping[str, Any], indent: str = "") -> Iterator[tuple[str, str
 def _number(value: Any) -> str:
     if isinstance(value, float):
         return "–" if math.isnan(value) else f"{value:.4g}"
-    return "–" if value is None else printable(str(value))
+    return "–" if value is None else errors.printable(str(value))
 
 
 COLUMNS = (
-    ("collision_rate", "collision\n%", 1),
-    ("offroad_time", "off-road\n%", 1),
-    ("ade", "ADE\nm", 2),
-    ("min_sade", "minSADE\nm", 2),
-    ("curvature_jsd", "JSD\nnats", 3),
-)
+    ("collision_rate", "collision\n%", 1), ("offroad_time", "off-road\n%", 1), ("ade", "ADE\nm", 2),
+    ("min_sade", "minSADE\nm", 2), ("curvature_jsd", "JSD\nnats", 3),
+)  # fmt: skip
 """Numbers in the table of agents, with the two lines of their headings, and digits."""
 
 
 def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, details: bool = False) -> None:
     """Print records of agents as one table and a line of what they are of; with details, all of their numbers."""
-    heads = [("agent\n", *(heading for _, heading, _ in COLUMNS))] * 2
-    table = [[heading.split("\n")[k] for heading in head] for k, head in enumerate(heads)]
+    heads = ["agent\n", *(heading for _, heading, _ in COLUMNS)]
+    table = [[heading.split("\n")[k] for heading in heads] for k in range(2)]
     named = [{**row, "agent": short_name(str(row["agent"]))} for row in rows]
     for row in named:
         numbers = ((row[n], row.get(f"{n}_se"), digits, row.get(f"{n}_bound")) for n, _, digits in COLUMNS)
@@ -207,10 +182,8 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, details: b
     driven = "all vehicles" if first["interactive"] == "all" else f"{first['interactive']} interactive agents"
     if first["interactive"] not in ("all", 1, 2):  # a segment with fewer has those that there are
         driven = f"up to {driven}"
-    say(
-        f"{first['segments']} run segments of {first['groups']} recordings, {driven} each, up to {most} rollouts; "
-        f"± standard error over recordings, ≤ exact bound of a zero (95 %); seed {first['seed']}"
-    )
+    text = f"{first['segments']} run segments of {first['groups']} recordings, {driven} each, up to {most} rollouts"
+    say(f"{text}; ± standard error over recordings, ≤ exact bound of a zero (95 %); seed {first['seed']}")
 
 
 def short_name(agent: str) -> str:

@@ -5,23 +5,16 @@ from __future__ import annotations
 import sys
 from dataclasses import field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 import symphony
+from symphony import errors, wosac
 from symphony.cli import shared
-from symphony.config import WosacSettings
-from symphony.config.checks import Natural
-from symphony.config.evaluation import FUTURE
-from symphony.errors import ConfigError, DataError
+from symphony.config import WosacSettings, checks, evaluation
 from symphony.wosac.meta import SubmissionMeta
 
-if TYPE_CHECKING:
-    from symphony.data.report import Skip
-
-SHARDS, SHOWN = 150, 20
-"""Files of an archive, as in the challenge's own example; problems that are printed."""
 Year = Annotated[Literal["2024", "2025"], arg(help="Year of the challenge.")]
 _AGENT = "Folder of a run (see `symphony train`), `pretrained:NAME`, or a baseline."
 Agent = Annotated[Positional[str], arg(metavar="RUN", help=_AGENT)]
@@ -44,22 +37,22 @@ class Score(shared.Command):
     config: Year = "2025"
     json: shared.Json = None
     per_object: bool = False  # Write the numbers of each scored object into the JSON, too.
-    #: Folder to write what is compared to, per object and step, as SCENARIO_ID.npz.
-    features: Annotated[Path | None, arg(metavar="DIR")] = None
+    features: shared.Folder = None  # Folder for what is compared, per object and step (SCENARIO_ID.npz).
     partial: bool = False  # Leave out scenarios without rollouts; otherwise each must have some.
     strict: Strict = False
     workers: shared.Workers = 1
 
     def __call__(self) -> None:
-        from symphony.wosac.files import score_files
+        from symphony.data.report import left_out
 
         options = {key: value for key, value in vars(self).items() if key not in ("scenario", "json")}
         with shared.progress("scoring", "scenarios") as advance:
-            found, skipped = score_files(self.scenario, **options, progress=advance)
+            found, skipped = wosac.score_files(self.scenario, **options, progress=advance)
         if shared.write_numbers(self.json, found):
             numbers = {name: value for name, value in found.items() if isinstance(value, float)}
             shared.print_facts(numbers, f"WOSAC {self.config}, {found['scenario_count']} scenarios")
-        _print_left_out(skipped)
+        for line in left_out(skipped):
+            shared.tell(f"left out: {line}")
 
 
 class Evaluate(shared.Command):
@@ -80,18 +73,19 @@ class Evaluate(shared.Command):
     settings: Annotated[WosacSettings, arg(name="")] = field(default_factory=WosacSettings)
 
     def __call__(self) -> None:
-        from symphony.wosac.evaluate import evaluate_wosac
+        from symphony.data.report import left_out
         from symphony.wosac.table import wosac_table
 
         agent = symphony.load_agent(self.agent, self.settings.device, trust_code=self.trust_code)
         store = symphony.SegmentStore(self.data)
         items = shared.segment_indices(store, self.segments) or list(range(len(store)))
-        options = {"baselines": self.baselines, "strict": self.strict}
+        how = {"baselines": self.baselines, "strict": self.strict}
         with shared.progress(f"scoring {agent.name}") as advance:
-            found = evaluate_wosac(agent, store, items, self.settings, self.config, advance, **options)
+            found = wosac.evaluate_wosac(agent, store, items, self.settings, self.config, advance, **how)
         if shared.write_numbers(self.json, found.record()):
             sys.stdout.write(wosac_table([found.record()]))
-        _print_left_out(found.left_out)
+        for line in left_out(found.left_out):
+            shared.tell(f"left out: {line}")
 
 
 class Table(shared.Command):
@@ -99,8 +93,7 @@ class Table(shared.Command):
 
     #: Files that `symphony wosac evaluate --json FILE` wrote.
     records: Annotated[Positional[shared.Paths], arg(metavar="FILE ...")]
-    #: Names of the agents; by default what the records say.
-    names: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ()
+    names: shared.Names = ()  # Names of the agents; by default what the records say.
     out: shared.ResultFile = None  # File to write it to; otherwise it is printed.
 
     def __call__(self) -> None:
@@ -120,30 +113,26 @@ class Submit(shared.Command):
     data: Scenarios
     out: Annotated[Path, shared.Result(), arg(metavar="FILE")]  # File to write (.tar.gz).
     meta: Annotated[SubmissionMeta, arg(name="")]
-    #: Number of files in the archive; 0: 150, or one a scenario where there are fewer.
-    shards: Natural = 0
+    shards: checks.Natural = 0  # Number of files in the archive; 0: 150, or one a scenario if they are fewer.
     trust_code: shared.TrustCode = False
     settings: Annotated[WosacSettings, arg(name="")] = field(default_factory=WosacSettings)
 
     def __post_init__(self) -> None:
-        if self.settings.logged_goals or self.settings.future != FUTURE:
-            raise ConfigError(
-                "a submission has 8 s and must not know the log: no --horizon, no --logged-goals"
-            )
+        if self.settings.logged_goals or self.settings.future != evaluation.FUTURE:
+            raise errors.ConfigError("a submission has 8 s and knows no log: no --horizon, no --logged-goals")
 
     def __call__(self) -> None:
         from symphony.wosac.simulate import simulated_scenarios
-        from symphony.wosac.submission import required_agents, write_submission
+        from symphony.wosac.submission import required_agents
 
         agent = symphony.load_agent(self.agent, self.settings.device, trust_code=self.trust_code)
-        # Before hours of simulation: that all can be read, and no scenario comes twice.
-        total = len(required_agents(self.data))
-        shards = self.shards or min(SHARDS, total)
+        total = len(required_agents(self.data))  # first of all: that all can be read, and none comes twice
+        shards = self.shards or min(150, total)  # as in the challenge's own example
         if shards > total:
-            raise ConfigError(f"{total} scenarios don't fill {shards} shards")
+            raise errors.ConfigError(f"{total} scenarios don't fill {shards} shards")
         with shared.progress(f"simulating {agent.name}", "scenarios") as advance:
             found = simulated_scenarios(agent, self.data, self.settings, lambda done: advance(done, total))
-            write_submission(found, self.meta, self.out, shards)
+            wosac.write_submission(found, self.meta, self.out, shards)
         shared.say(f"{total} scenarios, see symphony wosac validate {self.out} --scenario {self.data}")
 
 
@@ -158,22 +147,14 @@ class Validate(shared.Command):
     scenario: Annotated[Path | None, arg(metavar="FILE|DIR")] = None
 
     def __call__(self) -> None:
-        from symphony.wosac.submission import check_submission, required_agents
+        from symphony.wosac.submission import required_agents
 
         required = None if self.scenario is None else required_agents(self.scenario)
-        report = check_submission(self.submission, required)
-        for problem in report.problems[:SHOWN]:
+        report = wosac.check_submission(self.submission, required)
+        for problem in report.problems[:20]:
             shared.tell(str(problem))
         if report.problems:
-            raise DataError(f"{len(report.problems)} problems", file=self.submission)
+            raise errors.DataError(f"{len(report.problems)} problems", file=self.submission)
         shared.say(f"{len(report.scenarios)} scenarios in {len(report.shards)} shards, all well")
         if required is None:
             shared.say("Not checked, for want of --scenario: whether scenarios and agents are the right ones")
-
-
-def _print_left_out(skipped: list[Skip]) -> None:
-    """Print why scenarios have no score, on standard error."""
-    from symphony.data.report import left_out
-
-    for line in left_out(skipped):
-        shared.tell(f"left out: {line}")

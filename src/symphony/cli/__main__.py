@@ -1,5 +1,0 @@
-"""``python -m symphony.cli`` is the ``symphony`` command."""
-
-from symphony.cli import main
-
-raise SystemExit(main())
