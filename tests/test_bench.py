@@ -148,9 +148,7 @@ def test_as_many_groups_as_needed_and_no_more(limit: float, confidence: float) -
         ("[[crowd]]", "[[crowds]]", 14, "", "unknown table"),
     ],
 )
-def test_what_is_wrong_is_refused_before_anything_runs(
-    suite: Path, tmp_path: Path, capsys: Any, old: str, new: str, line: int, field: str, why: str
-) -> None:
+def test_what_is_wrong_is_refused_before_anything_runs(suite, tmp_path, capsys, old, new, line, field, why):
     suite.write_text(SUITE.replace(old, new, 1))
     assert main(["test", str(suite), "--out", str(tmp_path / "out")]) == 2
     said = re.sub(r"\s+", " ", capsys.readouterr().err)
@@ -198,9 +196,7 @@ def test_thresholds_that_are_lost_fail(suite: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "log" / "playback" / "view.html").exists()
 
 
-def test_stopping_early_changes_no_verdict(
-    suite: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stopping_early_changes_no_verdict(suite, tmp_path, monkeypatch):
     text = SUITE.replace("planners.py:fast", "planners.py:broken").replace("80", "20\nconfidence = false")
     suite.write_text(text)
     stopped = run_suite(read_suite(suite), tmp_path / "stopped")

@@ -218,9 +218,7 @@ def test_collisions_are_those_of_all_pairs() -> None:
 
 @settings(max_examples=60)
 @given(st.integers(1, 6), st.integers(1, 40), st.integers(1, 45), st.integers(0, 10**6), st.booleans())
-def test_the_smallest_are_the_first_of_a_stable_sort(
-    rows: int, width: int, count: int, seed: int, spoiled: bool
-) -> None:
+def test_the_smallest_are_the_first_of_a_stable_sort(rows, width, count, seed, spoiled):
     rng = np.random.default_rng(seed)
     values = rng.integers(0, 6, (rows, width)).astype(np.float32)
     values[values == 5] = np.inf

@@ -138,9 +138,7 @@ def test_wrong_usage_is_status_2(args: str, tmp_path: Path, monkeypatch: Any, ca
     (KeyboardInterrupt(), 130, "interrupted"),
     (ZeroDivisionError("is ours"), 0, ""),  # an error of programming is not hidden
 ])  # fmt: skip
-def test_failures_become_one_line_and_a_status(
-    error: Any, status: int, message: str, monkeypatch: Any, capsys: Any
-) -> None:
+def test_failures_become_one_line_and_a_status(error, status, message, monkeypatch, capsys):
     def fail(self: Info) -> None:
         raise error
 

@@ -76,9 +76,7 @@ TURNED = (
         (TURNED, (4, 2), (1, 0.2), 0.5),
     ],
 )
-def test_boxes_bound_their_shape(
-    path: Path, shape: str, size: tuple[float, float], place: tuple[float, float], turn: float
-) -> None:
+def test_boxes_bound_their_shape(path, shape, size, place, turn):
     heading = 0.7
     other = obstacle(8, [state(k, 20, 3, heading, 2.0) for k in range(5)], shape=shape)
     segment = convert(path, ROAD, driver(7), other)

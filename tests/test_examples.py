@@ -167,9 +167,7 @@ def test_a_recipe_learns_with_attention(example: Any, tmp_path: Path) -> None:
     assert "keys" in str(agent.policy)
 
 
-def test_every_cell_of_the_notebook_runs_and_is_kept_without_output(
-    tmp_path: Path, monkeypatch: Any, capsys: Any
-) -> None:
+def test_every_cell_of_the_notebook_runs_and_is_kept_without_output(tmp_path, monkeypatch, capsys):
     """Small: the sizes that the first cell sets are others here."""
     found = json.loads((EXAMPLES.parent / "docs" / "tutorial.ipynb").read_text(encoding="utf-8"))["cells"]
     cells = [cell for cell in found if cell["cell_type"] == "code"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -71,9 +70,7 @@ def drives(store: SegmentStore, space: str, cells: int, config: EvaluateConfig) 
     ],
 )
 @pytest.mark.parametrize("network", ["policy", "goals", "discriminator"])
-def test_weights_that_are_not_finite_are_found_at_once(
-    store: SegmentStore, network: str, space: str, cells: int, search: Any, rule: str
-) -> None:
+def test_weights_that_are_not_finite_are_found_at_once(store, network, space, cells, search, rule):
     config = EvaluateConfig(rollouts=2, search=search, rule=rule)
     drives(store, space, cells, config)
     broken = make_agent(space, cells)
@@ -101,9 +98,7 @@ def test_weights_that_are_not_finite_are_found_at_once(
         ("none", "best", math.nan, 1),
     ],
 )
-def test_segment_and_step_are_those_where_it_began(
-    store: SegmentStore, search: Any, rule: str, value: float, batch: int
-) -> None:
+def test_segment_and_step_are_those_where_it_began(store, search, rule, value, batch):
     good = make_agent()
     config = EvaluateConfig(rollouts=2, search=search, rule=rule, batch=batch)
     # Items of a batch of one are all its scene 0: the first segment is the bad one there.
@@ -136,9 +131,7 @@ def test_what_comes_after_the_end_of_a_segment_is_none_of_its_business(store: Se
             evaluate(early, store, config)
 
 
-def test_a_run_that_breaks_while_it_trains_is_not_validated_in_silence(
-    store: SegmentStore, tmp_path: Path
-) -> None:
+def test_a_run_that_breaks_while_it_trains_is_not_validated_in_silence(store, tmp_path):
     validation = ValidationConfig(data=store.path, rollouts=1)
     trainer = build(tiny("bc", store.path, tmp_path / "run", validation=validation))
     assert trainer.validator is not None

@@ -36,9 +36,7 @@ def little_memory(most: float) -> Iterator[None]:
     assert peak < most
 
 
-def test_many_parked_cars_one_late_state_and_files_beyond_all_measure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_parked_cars_one_late_state_and_files_beyond_all_measure(tmp_path, monkeypatch):
     parked, path = (
         [obstacle(100 + k, [state(0, k, 5)], role="static") for k in range(700)],
         tmp_path / "a.xml",

@@ -74,9 +74,7 @@ def of(network: str, found: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_each_method_trains_its_networks_and_tells_of_them(
-    trained: Trained, store: Path, tmp_path: Path, method: str
-) -> None:
+def test_each_method_trains_its_networks_and_tells_of_them(trained, store, tmp_path, method):
     run = trained(method)
     fresh, after = build(tiny(method, store, tmp_path)).agent.modules, weights(run)
     assert set(fresh) == {name.split(".")[0] for name in after} == NETWORKS[method]
@@ -106,18 +104,14 @@ def test_the_seed_decides_the_weights(trained: Trained, store: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_resumed_run_ends_like_an_uninterrupted_one(
-    trained: Trained, store: Path, tmp_path: Path, method: str
-) -> None:
+def test_a_resumed_run_ends_like_an_uninterrupted_one(trained, store, tmp_path, method):
     stopped(trained(method), tmp_path / "part", 2)
     train(tiny(method, store, tmp_path / "part", resume=True))
     assert same_weights(weights(tmp_path / "part"), weights(trained(method)))
     assert [r["step"] for r in read_metrics(tmp_path / "part")] == [1, 2, 3, 4]
 
 
-def test_a_warm_start_takes_over_what_both_runs_have(
-    trained: Trained, store: Path, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_a_warm_start_takes_over_what_both_runs_have(trained, store, tmp_path, monkeypatch):
     # Rates so small that no weight moves.
     monkeypatch.setattr("symphony.config.training.DISCRIMINATOR_RATE", 1e-30)
     changes: dict[str, Any] = {"learning_rate": 1e-30, "steps": 2, "seed": 9}
@@ -144,9 +138,7 @@ def test_a_resumed_run_does_not_start_warm_again(trained: Trained, store: Path, 
     assert same_weights(weights(tmp_path / "part"), weights(whole.out))
 
 
-def test_a_warm_start_that_does_not_fit_leaves_no_run_behind(
-    trained: Trained, store: Path, tmp_path: Path
-) -> None:
+def test_a_warm_start_that_does_not_fit_leaves_no_run_behind(trained, store, tmp_path):
     for source in (tmp_path / "nowhere", trained("bc_h")):
         with pytest.raises((ConfigError, CheckpointError)):
             train(tiny("bc", store, tmp_path / "run", warm_start=source))
@@ -164,9 +156,7 @@ GONE: list[tuple[str, Any, Any]] = [
 
 
 @pytest.mark.parametrize(("name", "always", "other"), GONE)
-def test_a_setting_that_is_gone_is_read_where_it_said_what_holds_now(
-    store: Path, tmp_path: Path, name: str, always: Any, other: Any
-) -> None:
+def test_a_setting_that_is_gone_is_read_where_it_said_what_holds_now(store, tmp_path, name, always, other):
     spec = build(tiny("bc_ts", store, tmp_path / "run")).agent.spec
     file, (part, last) = tmp_path / "agent.json", name.split(".")
     saved = json.loads(to_json(spec))
@@ -261,9 +251,7 @@ def test_what_is_searched_is_what_is_imitated(store: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("method", "per"), [("bc_ts_h", "tree"), ("bc_ts_h", "branch"), ("mgail_h", "tree")])
-def test_searches_follow_routes_that_the_goal_policy_draws(
-    store: Path, tmp_path: Path, method: Any, per: Any
-) -> None:
+def test_searches_follow_routes_that_the_goal_policy_draws(store, tmp_path, method, per):
     """As in evaluation: new ones at every search, feasible, those of a tree together unless branches draw alone."""
     wide = SearchConfig(branches=8, prune_every=99, updates=2, states=8, goals=per)
     replay, drawn = pieces(build(tiny(method, store, tmp_path, segments=3, search=wide)))["replay"], []
@@ -328,9 +316,7 @@ def test_fitted_states_are_those_of_the_experts(dataset: SceneDataset) -> None:
             assert torch.equal(progress[b, :steps, n], found.progress[rows.index(agent)])
 
 
-def test_one_search_serves_as_many_updates_as_configured(
-    store: Path, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_one_search_serves_as_many_updates_as_configured(store, tmp_path, monkeypatch):
     done: list[Any] = []
     for owner, name in ((Trainer, "_update"), (BeamSearchCollector, "rollout")):
         original = getattr(owner, name)

@@ -59,9 +59,7 @@ def test_steps_that_are_not_valid_do_not_count() -> None:
 
 @given(st.floats(1, 11), st.floats(1, 11), st.floats(2, 20), st.floats(2, 20), st.floats(-4, 4))
 @example(1.0, 1.0, 2.0, 3.0, 1.0)
-def test_swapping_turning_and_moving(
-    mine: float, theirs: float, speed: float, other: float, angle: float
-) -> None:
+def test_swapping_turning_and_moving(mine, theirs, speed, other, angle):
     a, b = along_x(mine, speed).double(), along_y(theirs, other).double()
     plain = gap(a, b)
     assert gap(b, a) == pytest.approx(-plain)

@@ -282,9 +282,7 @@ def test_a_segment_without_its_ego_is_on_record(store: Path, tmp_path: Path) -> 
         run(store, tmp_path / "sim", "idm", search="none")
 
 
-def test_the_command_simulates_reports_and_shows(
-    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_simulates_reports_and_shows(store, tmp_path, monkeypatch, capsys):
     (tmp_path / "mine.py").write_text(
         "class Planner:\n"
         "    def reset(self, scenario):\n"
@@ -314,9 +312,7 @@ def test_the_command_simulates_reports_and_shows(
     search=st.sampled_from(["none", "tree", "best"]),
     trees=st.sampled_from([1, 2, 16]),
 )
-def test_runs_are_spread_over_as_many_segments_as_there_are(
-    runs: int, segments: int, search: Any, trees: int
-) -> None:
+def test_runs_are_spread_over_as_many_segments_as_there_are(runs, segments, search, trees):
     agent = small()
     config = EvaluateConfig(search=search, trees=trees, rule="systematic", branches=16)
     count, how = spread_runs(agent, config, runs, segments)
@@ -333,9 +329,7 @@ def test_runs_are_spread_over_as_many_segments_as_there_are(
         assert (count, how.rollouts) == (runs, 1)
 
 
-def test_a_hundred_runs_are_a_hundred_and_beside_the_log_the_ego_is_alone(
-    store: Path, tmp_path: Path
-) -> None:
+def test_a_hundred_runs_are_a_hundred_and_beside_the_log_the_ego_is_alone(store, tmp_path):
     words = ["--data", str(store), "--planner", "idm", "--duration", "2", "--out", str(tmp_path / "sim")]
     assert main(["simulate", "playback", "--runs", "9", "--rollouts", "3", *words]) == 2
     assert main(["simulate", "playback", "--runs", "9", *words]) == 0

@@ -140,9 +140,7 @@ def test_equal_planners_of_every_kind_drive_alike(store: Path, tmp_path: Path) -
         ("twice", "", "step [23]: .*(more than one line for an answer|answered)"),
     ],
 )
-def test_what_a_process_says_wrong_fails_the_run(
-    store: Path, tmp_path: Path, kind: str, said: str, why: str
-) -> None:
+def test_what_a_process_says_wrong_fails_the_run(store, tmp_path, kind, said, why):
     for saved in alone(store, tmp_path / "sim", process(tmp_path, kind, said)):
         assert re.search(why, saved.failed[0]), saved.failed
         assert saved.counted[0].sum() in (2, 3)
@@ -171,9 +169,7 @@ def test_what_a_process_started_ends_with_it(store: Path, tmp_path: Path) -> Non
     assert not any(map(lives, children))
 
 
-def test_a_process_gets_a_small_environment(
-    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_gets_a_small_environment(store, tmp_path, monkeypatch):
     for name in ("SECRET", "GIVEN", "ALSO", "PYTHONHASHSEED", "LANG"):
         monkeypatch.setenv(name, "1")
     monkeypatch.setenv("SYMPHONY_PLANNER_ENV", "GIVEN, ALSO")
@@ -271,9 +267,7 @@ def test_the_score_of_a_run(changes: dict[str, Any], score: float | None) -> Non
     assert run_score({**FINE, "progress_ratio": 0.5, **changes}) == score
 
 
-def test_the_command_compares_planners_among_crowds(
-    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_compares_planners_among_crowds(store, tmp_path, capsys):
     words = ["--data", str(store), "--rollouts", "2", "--search", "none", "--duration", "2"]
     places = []
     for name in ("idm", "log"):

@@ -113,9 +113,7 @@ def test_a_run_shows_itself_now_and_then_and_at_its_end(run: Path) -> None:
 
 @pytest.mark.parametrize(("method", "validated"), [("bc_ts_h", True), ("mgail", False)])
 @pytest.mark.usefixtures("undrawn")
-def test_being_watched_changes_nothing(
-    store: Any, held_out: Any, tmp_path: Any, method: str, validated: bool
-) -> None:
+def test_being_watched_changes_nothing(store, held_out, tmp_path, method, validated):
     extra = {"validation": ValidationConfig(data=held_out if validated else None, rollouts=2)}
     blind, watched = (train(config(store, tmp_path / str(n), n, method, **extra)) for n in (0, 2))
     assert same_weights(weights(f"{blind}@last"), weights(f"{watched}@last"))
@@ -141,9 +139,7 @@ def test_a_resumed_run_shows_the_rest_whatever_is_there(store: Path, tmp_path: P
     assert media(whole.out)[-1] == "rollout-000008.gif"
 
 
-def test_segments_to_validate_on_are_shown_where_there_are_some(
-    store: Path, held_out: Path, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_segments_to_validate_on_are_shown_where_there_are_some(store, held_out, tmp_path, monkeypatch):
     seen: list[str] = []
 
     def note(clips: list[Clip], path: Path) -> None:
@@ -236,9 +232,7 @@ def test_weights_and_biases_gets_video_and_histograms(store: Path, tmp_path: Pat
         assert all(isinstance(value, wandb.Histogram) and sum(value.histogram) for value in values.values())
 
 
-def test_a_run_is_named_once_at_weights_and_biases_and_its_variables_hold(
-    tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_a_run_is_named_once_at_weights_and_biases_and_its_variables_hold(tmp_path, monkeypatch):
     import wandb
 
     told: list[dict[str, Any]] = []

@@ -69,9 +69,7 @@ numbers = st.floats(-50, 50, width=32)
 
 
 @given(arrays(np.float64, 2, elements=numbers), st.floats(-7, 7), st.floats(0.5, 12), st.floats(0.3, 3))
-def test_box_agrees_with_shapely_and_its_nose_is_ahead(
-    position: Any, heading: float, length: float, width: float
-) -> None:
+def test_box_agrees_with_shapely_and_its_nose_is_ahead(position, heading, length, width):
     at = position[None], np.array([heading]), np.array([[length, width]])
     box, nose = shapely.Polygon(place(CORNERS, *at)[0]), place(NOSE, *at)[0]
     plain = shapely.box(-length / 2, -width / 2, length / 2, width / 2)
@@ -374,9 +372,7 @@ def standing(segment: RunSegment, agents: list[int]) -> RunSegment:
 
 
 @pytest.mark.parametrize(("steps", "start"), [(2, 0), (6, 1), (12, 0), (13, 0), (25, 0)])
-def test_frames_are_the_steps_or_evenly_fewer_in_real_time(
-    steps: int, start: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_are_the_steps_or_evenly_fewer_in_real_time(steps, start, tmp_path, monkeypatch):
     monkeypatch.setattr("symphony.render.video.FRAMES", 12)
     segment, file, shown = crossing(3, steps=steps), tmp_path / "a.gif", steps - start
     drawn, every = frames([rollouts(segment, [0], 1, start)], file), -(-shown // 12)

@@ -235,9 +235,7 @@ def test_moving_and_turning_the_world_changes_nothing() -> None:
         assert two[name] == (pytest.approx(value, abs=2e-2) if isinstance(value, float) else value), name
 
 
-def test_the_command_writes_page_numbers_and_table(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_page_numbers_and_table(tmp_path, capsys):
     types, sim = np.array([AgentType.VEHICLE, AgentType.CYCLIST], np.uint8), tmp_path / "sim"
     hit = driving((0, 0, 0, 12), (10, 0, 0, 7), segment_id="a&b <i>")
     free = driving((0, 0, 0, 7), (10, 0, 0, 7), segment_id="free", agent_type=types)

@@ -116,9 +116,7 @@ def test_frame_and_order_do_not_matter(case: str, angle: float, shift: Any, rand
     st.booleans(),
     st.floats(-8, 8),
 )
-def test_crossing_is_a_matter_of_time(
-    speed: float, other_speed: float, angle: float, right: bool, gap: float
-) -> None:
+def test_crossing_is_a_matter_of_time(speed, other_speed, angle, right, gap):
     """Whatever the speeds and the angle, two that pass one place within the limit cross."""
     # The place is as wide as half a step and half a metre of either: at an acute angle a slow one needs time for it.
     mine = (speed * DT / 2 + 0.5) / np.sin(angle)

@@ -38,9 +38,7 @@ def at(line: Reals, along: Reals) -> Reals:
     seed=st.integers(0, 999),
     hidden=st.booleans(),
 )
-def test_who_drives_around_a_block_gets_on(
-    radius: float, speed: float, start: float, seed: int, hidden: bool
-) -> None:
+def test_who_drives_around_a_block_gets_on(radius, speed, start, seed, hidden):
     # Up to two and a half times around: every place is passed again.
     line = bend(1.0, radius)
     arc = np.linalg.norm(np.diff(line, axis=0), axis=-1).sum()

@@ -193,9 +193,7 @@ def test_the_text_reads_back(seeds: int, dataset: Any) -> None:
     assert [line[1] for line in lines[4:]] == [str(seeds)] * 8
 
 
-def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(
-    tmp_path: Path, monkeypatch: Any, capsys: Any
-) -> None:
+def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(tmp_path, monkeypatch, capsys):
     store = tmp_path / "test"
     fill(store, [straight_road(4, seed=1, steps=8), crossing(4, seed=1, steps=8)])
     (tmp_path / "empty").mkdir()

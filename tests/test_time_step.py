@@ -44,9 +44,7 @@ def test_constant_velocity_is_as_far_off_at_any_rate(stores: dict[float, Path]) 
     assert found[0.1]["ade"] == pytest.approx(found[0.2]["ade"], rel=0.1)
 
 
-def test_agents_refuse_another_rate_than_they_learned(
-    stores: dict[float, Path], run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_agents_refuse_another_rate_than_they_learned(stores, run, capsys):
     assert evaluate(str(run), stores[0.2], EvaluateConfig(rollouts=1)).metrics.compute()["segments"] == 2
     message = r"learned steps of 0\.2 s and can't drive in steps of 0\.1 s.*--rate 5"
     with pytest.raises(ConfigError, match=message):
@@ -55,9 +53,7 @@ def test_agents_refuse_another_rate_than_they_learned(
     assert "--rate 5" in capsys.readouterr().err
 
 
-def test_training_at_another_rate_is_refused_before_the_first_update(
-    stores: dict[float, Path], run: Path, tmp_path: Path
-) -> None:
+def test_training_at_another_rate_is_refused_before_the_first_update(stores, run, tmp_path):
     """A warm start from another rate, and a validation at another one."""
     train(tiny("bc", stores[0.2], tmp_path / "same", steps=2, warm_start=run))
     with pytest.raises(ConfigError, match=r"run learned steps of 0\.2 s and can't drive in steps of 0\.1 s"):

@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -80,9 +79,7 @@ COMMANDS: dict[str, Callable[[str], list[str]]] = {
 
 
 @pytest.mark.parametrize("lock", COMMANDS)
-def test_commands_that_write_refuse_a_second(
-    lock: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_commands_that_write_refuse_a_second(lock, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     save_rollouts("sim", *searched())
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
@@ -94,9 +91,7 @@ def test_commands_that_write_refuse_a_second(
     assert after == before
 
 
-def test_a_folder_that_learns_is_taken_over_by_nobody(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_that_learns_is_taken_over_by_nobody(tmp_path, monkeypatch):
     config = tiny("bc", builtin_store("train"), tmp_path / "run", steps=2, checkpoint_every=1)
     monkeypatch.setattr(Lock, "check", lambda self: (_ for _ in ()).throw(DataError("taken")))
     with pytest.raises(DataError, match="taken"):

@@ -83,9 +83,7 @@ def test_cells_show_bounds_of_zeros_and_dashes() -> None:
     assert number_cell(None, None, 1, None) == number_cell(math.nan, math.nan, 1) == "–"
 
 
-def test_the_report_prints_dashes_counts_and_bounds(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_report_prints_dashes_counts_and_bounds(tmp_path, capsys):
     saved = [played(segment_of(case, 0.2, 0.0)[0]) for case in (FREE, UNBOUNDED)]
     save_rollouts(tmp_path / "sim", About("made"), saved)
     assert main(["report", str(tmp_path / "sim"), "--no-view", "--evaluated", "ego"]) == 0
