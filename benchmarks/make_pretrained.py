@@ -28,8 +28,9 @@ import numpy as np
 import torch
 
 from symphony.agents import build_agent
-from symphony.agents.agent import CARD, FILE, FOLDER, PREFIX, choose, read_card, read_spec, split_name
+from symphony.agents.agent import FILE, read_spec
 from symphony.agents.checkpoint import load_checkpoint, save_checkpoint
+from symphony.agents.choice import CARD, FOLDER, PREFIX, choose, read_card, split_name
 from symphony.cli.shared import COLUMNS
 from symphony.config import AgentSpec, EvaluateConfig, TrainConfig, read_json, to_json
 from symphony.data.generate import PRESETS

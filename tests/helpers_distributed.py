@@ -19,7 +19,7 @@ from torch import Tensor
 
 from helpers_runs import pieces, tiny
 from symphony import keys
-from symphony.agents.agent import choose
+from symphony.agents.choice import choose
 from symphony.config import MGAILConfig, TrainConfig, ValidationConfig
 from symphony.errors import ConfigError
 from symphony.learning import SceneDataset

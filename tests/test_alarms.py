@@ -18,7 +18,7 @@ from torch import Tensor
 from helpers_runs import build, tiny
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
-from symphony.agents.agent import choose
+from symphony.agents.choice import choose
 from symphony.cli import main
 from symphony.objectives import BCLoss
 from symphony.recipes import train

@@ -21,7 +21,6 @@ from torch import nn
 from helpers_runs import tiny
 from helpers_segments import crossing
 from helpers_store import fill
-from symphony.agents.agent import choose
 from symphony.agents.checkpoint import (
     MANIFEST,
     CheckpointError,
@@ -33,6 +32,7 @@ from symphony.agents.checkpoint import (
     prune,
     save_checkpoint,
 )
+from symphony.agents.choice import choose
 from symphony.config import ValidationConfig
 from symphony.errors import DataError, SymphonyError
 from symphony.recipes import train

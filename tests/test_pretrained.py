@@ -13,10 +13,10 @@ import torch
 
 from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
-from symphony.agents import agent as pretrained
+from symphony.agents import choice as pretrained
 from symphony.agents import load_agent
-from symphony.agents.agent import choose
 from symphony.agents.checkpoint import checkpoints, parts_of
+from symphony.agents.choice import choose
 from symphony.cli import main
 from symphony.config import AgentSpec, EvaluateConfig, MGAILConfig, ValidationConfig, to_json
 from symphony.data.store_writer import StoreWriter

@@ -17,8 +17,8 @@ from helpers_processes import output_of
 from helpers_runs import build, same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
-from symphony.agents.agent import choose
 from symphony.agents.checkpoint import CheckpointError, checkpoints, latest
+from symphony.agents.choice import choose
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.recipes import train
 from symphony.training import trainer as training

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from symphony.agents import load_agent
-from symphony.agents.agent import pretrained_folder
+from symphony.agents.choice import pretrained_folder
 from symphony.cli import main
 from symphony.data.builtin import builtin_store
 from symphony.data.npz import read_npz

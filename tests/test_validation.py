@@ -17,8 +17,8 @@ from helpers_runs import build, same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
 from symphony.agents import load_agent
-from symphony.agents.agent import Best, choose, split_name
 from symphony.agents.checkpoint import CheckpointError, checkpoints, save_checkpoint
+from symphony.agents.choice import Best, choose, split_name
 from symphony.config import EvaluateConfig, TrainConfig, ValidationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate

@@ -28,8 +28,8 @@ from helpers_scenarionet import write as scenarionet
 from helpers_segments import crossing, straight_road
 from helpers_sources import ROAD, commonroad, driver, obstacle, state, womd_scenario
 from helpers_wosac import record_rollouts, womd_record
-from symphony.agents.agent import Best
 from symphony.agents.checkpoint import MANIFEST, checkpoints, load_checkpoint, save_checkpoint
+from symphony.agents.choice import Best
 from symphony.cli.rollouts import write_view
 from symphony.config import AgentSpec, DiscriminatorConfig, TrainConfig, read_json, to_json
 from symphony.data.convert import info

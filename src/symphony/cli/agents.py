@@ -41,7 +41,7 @@ class Train(shared.Command):
 
 def last_words(folder: Path, config: symphony.TrainConfig) -> list[str]:
     """Which checkpoint of a run is its agent and how good it is, and what to do next."""
-    from symphony.agents.agent import best_of, choose
+    from symphony.agents.choice import best_of, choose
 
     score = "the last one; nothing was validated, see --validation.data"
     if (best := best_of(choose(folder, "last"))) is not None:
@@ -163,7 +163,7 @@ class Agents(shared.Command):
     json: shared.Json = None
 
     def __call__(self) -> None:
-        from symphony.agents.agent import PREFIX, pretrained_folder, pretrained_names, read_card
+        from symphony.agents.choice import PREFIX, pretrained_folder, pretrained_names, read_card
 
         names = self.names or tuple(PREFIX + name for name in pretrained_names())
         folders = [pretrained_folder(name) for name in names]

@@ -30,7 +30,7 @@ class Curvature(shared.Command):
     def __call__(self) -> None:
         import numpy as np
 
-        from symphony.agents.agent import split_name
+        from symphony.agents.choice import split_name
         from symphony.evaluation.records import choose_evaluation, kept_evaluations, read_run
         from symphony.evaluation.table import method_name
         from symphony.metrics import jensen_shannon

@@ -13,8 +13,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from symphony.agents.agent import PREFIX, choose, split_name
 from symphony.agents.checkpoint import checkpoints
+from symphony.agents.choice import PREFIX, choose, split_name
 from symphony.config import EvaluateConfig
 from symphony.errors import ConfigError, DataError
 from symphony.files import write_json

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from symphony import keys
-from symphony.agents.agent import Agent, Best
+from symphony.agents.agent import Agent
+from symphony.agents.choice import Best
 from symphony.config import EvaluateConfig, RunConfig, ValidationConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.scene import SceneBatch

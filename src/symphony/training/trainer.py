@@ -23,7 +23,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from symphony import allocator
-from symphony.agents.agent import FILE, Agent, Best, choose, read_spec, split_name
+from symphony.agents.agent import FILE, Agent, read_spec
 from symphony.agents.checkpoint import (
     MANIFEST,
     CheckpointError,
@@ -33,6 +33,7 @@ from symphony.agents.checkpoint import (
     prune,
     save_checkpoint,
 )
+from symphony.agents.choice import Best, choose, split_name
 from symphony.config import AgentSpec, RunConfig, read_json, to_json
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.files import Lock, write_file

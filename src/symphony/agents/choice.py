@@ -1,0 +1,119 @@
+"""Which checkpoint of a run is its agent: the best by validation, the last, or one that is named; included agents."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from symphony.agents.checkpoint import MANIFEST, CheckpointError, checkpoints, load_checkpoint
+from symphony.errors import ConfigError, DataError
+
+PREFIX = "pretrained:"
+"""Names of agents that come with the package begin with it."""
+FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
+CARD = "card.json"
+"""Model card in an agent's folder."""
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best checkpoint so far: its step, and its collision rate plus its off-road time, percent."""
+
+    step: int
+    infractions: float
+
+    @classmethod
+    def of(cls, extra: Mapping[str, Any]) -> Best | None:
+        """What the extra values of a checkpoint tell; None if nothing was validated up to then."""
+        found = extra.get("best")
+        if found is None:
+            return None
+        values: Any = [found.get(name) for name in ("step", "infractions")] if isinstance(found, dict) else []
+        if [type(value) for value in values] != [int, float] or not min(values) >= 0:
+            raise CheckpointError("no step with its infractions", field="extra.best")
+        return cls(*values)
+
+
+def split_name(name: str) -> tuple[Path, str]:
+    """From ``RUN[@WHICH]``, the folder of a run and which of its checkpoints is meant ("" if it doesn't say);
+    ``pretrained:NAME`` is the folder of an agent that comes with the package.
+    """
+    if name.startswith(PREFIX):
+        known, _, which = name.partition("@")
+        return pretrained_folder(known), which
+    run, at, which = name.rpartition("@")
+    # A folder's own name may hold the sign.
+    return (Path(run), which) if at and not Path(name).is_dir() else (Path(name), "")
+
+
+def best_of(last: Path) -> Best | None:
+    """What the last checkpoint of a run tells of its best one; None if nothing was validated."""
+    try:
+        return Best.of(load_checkpoint(last, partial=True, restore_rng=False).extra)
+    except CheckpointError as error:
+        raise error.at(file=last / MANIFEST) from error
+
+
+def choose(folder: Path, which: str = "") -> Path:
+    """The checkpoint of a run that is meant.
+
+    The last one knows which is the best, so that there is no second record to fall out of step with it.
+
+    Args:
+        folder: of the run.
+        which: ``best``, ``last``, or a step such as ``3000`` or ``step-3000``; by default the best if the run was
+            validated, else the last.
+
+    Raises:
+        ConfigError: if there is no such checkpoint.
+        CheckpointError: if the last one can't be read.
+    """
+    found = {int(path.name[-12:]): path for path in checkpoints(folder / "checkpoints")}
+    if not found:
+        raise ConfigError(f"{folder}: the run has no checkpoint yet")
+    last, held = max(found), f"it has those of the steps {', '.join(map(str, found))}"
+    if named := re.fullmatch(r"(?:step-)?(\d+)", which):
+        if int(named[1]) not in found:
+            raise ConfigError(f"{folder}: no checkpoint of step {int(named[1])}, {held}")
+        return found[int(named[1])]
+    if which not in ("", "best", "last"):
+        raise ConfigError(f"{folder}: '{which}' is no checkpoint; name best, last or a step, {held}")
+    best = None if which == "last" else best_of(found[last])
+    if best is None and which == "best":
+        raise ConfigError(f"{folder}: the run was not validated, so that none is the best; {held}")
+    step = last if best is None else best.step
+    if step not in found:
+        raise CheckpointError(f"the best checkpoint, of step {step}, is gone; {held}", file=folder)
+    return found[step]
+
+
+def pretrained_names() -> list[str]:
+    """All there are, without prefix."""
+    return sorted(path.parent.name for path in FOLDER.glob("*/agent.json"))
+
+
+def pretrained_folder(name: str) -> Path:
+    """The folder of ``pretrained:NAME``; a ConfigError says which there are if it is none of them."""
+    wanted, names = name.removeprefix(PREFIX), pretrained_names()
+    if wanted not in names:
+        close = difflib.get_close_matches(wanted, names, 1)
+        hint = f"did you mean '{PREFIX}{close[0]}'? " if close else ""
+        known = ", ".join(PREFIX + known for known in names) or "none"
+        raise ConfigError(f"no agent '{name}' comes with this package; {hint}there are: {known}")
+    return FOLDER / wanted
+
+
+def read_card(folder: Path) -> dict[str, Any]:
+    """The model card in the folder of an agent: ``name``, ``method``, ``about``, ``training``, ``settings``,
+    ``scores`` (one for each data set it was evaluated on) and ``limits``.
+    """
+    file = folder / CARD
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise DataError("the agent has no model card", file=file) from error
