@@ -10,10 +10,10 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from symphony.data.selection import relations
+from symphony.data.selection import Context, relations
 from symphony.metrics import order_statistics, passing_gap
 from symphony.metrics.order import REACH
-from test_selection import CASES, scene
+from test_selection import BY_CONTEXT, CASES, scene
 
 STEPS, DT = 60, 0.2
 TIME = torch.arange(STEPS) * DT
@@ -81,9 +81,7 @@ def test_statistics() -> None:
     assert found.gap_error == pytest.approx((1 + 4 + 1 + 0 + 0 + 1 + 1) / 7)
 
 
-@pytest.mark.parametrize("case", [
-    "turns in before", "turns in after", "changes lane ahead", "ego changes lane", "crosses", "crosses from a stop",
-])  # fmt: skip
+@pytest.mark.parametrize("case", [*BY_CONTEXT[Context.MERGE], *BY_CONTEXT[Context.CROSSING]])
 def test_pairs_that_interact_pass_one_after_the_other(case: str) -> None:
     segment = scene(CASES[case][1])
     found = relations(segment, np.array([1]))

@@ -186,7 +186,7 @@ def test_submission(tmp_path, capsys):
     write_records(data, [one.SerializeToString() for one in (mixed_record(), womd_record("bbbb"))])
     for more, text in (
         ((AGENT, "--shards", "3"), "don't fill 3 shards"),
-        ((AGENT, "--logged-goals"), "must not know the log"),
+        ((AGENT, "--logged-goals"), "knows no log"),
         ((AGENT, "--horizon", "5"), "a submission has 8 s"),
     ):
         assert submitted(data, out, *more) != 0
