@@ -57,12 +57,18 @@ def offroad_flags(
     if tables is None or height is not None or not on_host(position) or scenes.edge_start.shape[1] == 0:
         return road_distance(scenes, scene, position, tables, height) > 0
     row, where = scene.repeat_interleave(position.shape[1]), position.detach().reshape(-1, 2)
+    x, y = np.ascontiguousarray(where.numpy().T)
     cells = tables.edge_cells
-    cell = cells.at(row.numpy(), *np.ascontiguousarray(where.numpy().T))
-    sign = torch.from_numpy(cells.sign[cell])
-    flags, asked = sign > 0, (sign == 0).nonzero().squeeze(-1)
+    cell = cells.at(row.numpy(), x, y)
+    sign = cells.sign[cell]
+    off, asked = sign > 0, np.flatnonzero((sign == 0) & (cell >= 0))
     if len(asked):
-        flags[asked] = road_distance(scenes, row[asked], where[asked, None], tables).squeeze(1) > 0
+        near = cells.nearest_edge(cell[asked], x[asked], y[asked])
+        off[asked] = cells.right_of(near, x[asked], y[asked])
+    far = torch.from_numpy(np.flatnonzero(cell < 0))
+    flags = torch.from_numpy(off)
+    if len(far):
+        flags[far] = road_distance(scenes, row[far], where[far, None]).squeeze(1) > 0
     return flags.view(position.shape[:2])
 
 

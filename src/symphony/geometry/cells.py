@@ -260,6 +260,26 @@ class EdgeCells(Cells):
         nearest[np.repeat(np.arange(len(cell)), held)[hit]] = candidate[hit]
         return nearest.astype(np.int64)
 
+    def right_of(self, nearest: Indices, x: Reals, y: Reals) -> Bools:
+        """Whether positions [R] lie to the right of their nearest edges, as the sign of
+        :func:`symphony.geometry.signed_distance` says, in a third of the time.
+        """
+        along, right = self._beside(nearest, x, y)
+        past = along > 2 * self.edges[4, nearest]
+        for link, beyond, ahead in zip(self.links, (along < 0, past), (False, True), strict=True):
+            at = np.flatnonzero(beyond & (link[nearest] >= 0))
+            here, other = nearest[at], link[nearest[at]]
+            _, also = self._beside(other, x[at], y[at])
+            first, second = (self.edges[2:4, edge] for edge in ((here, other) if ahead else (other, here)))
+            left = first[0] * second[1] - first[1] * second[0] > 0
+            right[at] = np.where(left, right[at] | also, right[at] & also)
+        return right
+
+    def _beside(self, edge: Indices, x: Reals, y: Reals) -> tuple[Reals, Bools]:
+        start_x, start_y, unit_x, unit_y, _ = self.edges[:, edge]
+        away_x, away_y = x - start_x, y - start_y
+        return away_x * unit_x + away_y * unit_y, away_x * unit_y - away_y * unit_x > 0
+
 
 def _squared_to(edges: Sequence[Reals] | Reals, x: Reals, y: Reals) -> Reals:
     """Squared metres from positions to edges [5, ...] as :class:`EdgeCells` keeps them."""
