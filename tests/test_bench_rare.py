@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -128,3 +129,24 @@ def test_the_command_finds_the_rate_of_free_rollouts_and_keeps_what_shows_it(tmp
     assert saved.collision[:, :, 0].any(1).all()
     assert main(["hunt", *words, *kept]) == 1  # the folder is not new
     assert main(["hunt", "idm", *words[1:], "--out", str(tmp_path / "idm")]) == 1  # nothing is random there
+
+
+def test_a_hunt_says_no_zero_for_what_it_does_not_know(tmp_path, capsys):
+    (tmp_path / "fails.py").write_text("def plan(s): raise ValueError('flat tyre')\n")
+    words = f"hunt pretrained:bc_ts_h --data {builtin_store('test')} --trees 2 --branches 2".split()
+
+    def told(planner, segment, *more):
+        out = str(tmp_path / f"out-{len(list(tmp_path.iterdir()))}")
+        code = main([*words, "--planner", planner, "--segments", segment, "--out", out, *more])
+        return code, *capsys.readouterr()
+
+    fails = f"{tmp_path / 'fails.py'}:plan"
+    code, _, error = told(fails, "0")
+    assert code == 1
+    assert re.search(r"segment sumo-town-001000-f0-w09-v29: .* in 4 of 4 runs, the first: .*flat tyre", error)
+    found = json.loads(told(fails, "0", "--metric", "failed_rate", "--json", "-")[1])
+    assert [one["rate"] for one in found] == [pytest.approx(1.0, abs=0.5)] * 2
+    # Nobody is hit: the rate is 0 as far as was seen, and has no error; no light is there to be run.
+    zero = json.loads(told("log", "0", "--json", "-")[1])[-1]
+    assert (zero["rate"], zero["error"]) == (0.0, None)
+    assert re.search(r"– +– +0\nno run shows it", told("log", "3", "--metric", "red_light_rate")[1])

@@ -27,7 +27,7 @@ from symphony.agents import Agent
 from symphony.bench.measures import MEASURES
 from symphony.collectors import BeamSearchResult, Systematic
 from symphony.config import EvaluateConfig
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import Report, add_segment
 from symphony.learning.demonstrations import SceneDataset
 from symphony.planners.driver import EgoPlanners
@@ -66,7 +66,8 @@ def leaf_weights(found: BeamSearchResult) -> Float[Tensor, "*b L"]:
 class Rate:
     """How often something happens: a share, its standard error over trees, and the simulated runs that showed it.
 
-    ``segment`` is None for the mean over segments, whose error is that for these segments, not for others.
+    ``segment`` is None for the mean over segments, whose error is that for these segments, not for others. NaN: the
+    metric is not defined there, or, of an error, nothing was seen that would have one.
     """
 
     segment: str | None
@@ -105,9 +106,14 @@ class Hunt:
                 saved = saved_rollouts(segment, on_cpu, rollouts, b, failed=found.failed[b], **about)
                 report = Report(agent.name, "ego")
                 add_segment(report, saved)
+                if saved.failed and self.metric != "failed_rate":
+                    lost = f"{name} failed in {len(saved.failed)} of {saved.rollouts} runs, the first: "
+                    why = f"{min(saved.failed.items())[1]}; metric failed_rate counts such runs"
+                    raise DataError(lost + why, segment=segment.segment_id)
                 values = [MEASURES[self.metric].of(run) for run in report.rows]
                 hits = np.array([bool(value) for value in values]).reshape(weight[b].shape)
-                out.append((_kept(saved, hits), (hits * weight[b]).mean(-1)))
+                known = np.nan if None in values else 1.0
+                out.append((_kept(saved, hits), (hits * weight[b]).mean(-1) * known))
             return out
 
 
@@ -122,7 +128,8 @@ def _kept(saved: SavedRollouts, hits: NDArray[np.bool_]) -> SavedRollouts:
 
 def _rate(segment: str, estimates: NDArray[np.float64], shown: int) -> Rate:
     """The mean of the estimates of independent trees."""
-    error = float(estimates.std(ddof=1)) / math.sqrt(len(estimates)) if len(estimates) > 1 else math.inf
+    seen = len(estimates) > 1 and bool(estimates.any())
+    error = float(estimates.std(ddof=1)) / math.sqrt(len(estimates)) if seen else math.nan
     return Rate(segment, float(estimates.mean()), error, shown)
 
 
@@ -133,6 +140,7 @@ def hunt(path: Path, hunter: Hunt, progress: Callable[[int, int], None] | None =
 
     Raises:
         ConfigError: nothing is drawn at random around the planner, it can't be copied, or the folder is not new.
+        DataError: the planner failed in a run, which no other metric than ``failed_rate`` counts.
         SymphonyError: as of :func:`symphony.saved.saving.save_simulation`.
     """
     agent, data, config = hunter.agent, hunter.dataset, hunter.config
@@ -164,6 +172,8 @@ def hunt(path: Path, hunter: Hunt, progress: Callable[[int, int], None] | None =
                     progress(len(found), len(items))
     if not found:
         raise ConfigError("the ego of no run segment can be driven")
-    error = math.hypot(*(one.error for one in found)) / len(found)
-    mean = sum(one.rate for one in found) / len(found)
+    known = [one for one in found if not math.isnan(one.rate)]
+    seen = [one for one in known if one.rate > 0]
+    mean = sum(one.rate for one in seen) / len(known) if known else math.nan
+    error = math.hypot(*(one.error for one in seen)) / len(known) if seen else math.nan
     return [*found, Rate(None, mean, error, sum(one.shown for one in found))]

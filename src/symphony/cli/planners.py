@@ -128,7 +128,7 @@ class Hunt(shared.Command):
         if shared.write_numbers(self.json, [asdict(one) for one in found]):
             rows = [["segment", f"{MEASURES[self.metric].text} %", "±", "runs kept"]]
             for one in found:
-                numbers = (f"{100 * one.rate:.3g}", f"{100 * one.error:.2g}", str(one.shown))
-                rows.append([one.segment or f"all {len(found) - 1}", *numbers])
+                told = [shared.number_cell(100 * x, None, 3) for x in (one.rate, one.error)]
+                rows.append([one.segment or f"all {len(found) - 1}", *told, str(one.shown)])
             shared.print_table(rows, heads=1)
-            shared.say(f"runs that show it: symphony view {self.out}")
+            shared.say(f"see them: symphony view {self.out}" if found[-1].shown else "no run shows it")
