@@ -370,7 +370,7 @@ def test_two_evaluations_of_one_row_and_seed_need_a_choice(tmp_path: Path) -> No
         collect([run], "main")
     assert len(collect([run], "main", ["*-seed3"])[0]) == 1
     make_run(tmp_path / "two", "bc_h", 3, make_record(seed=3))
-    with pytest.raises(ConfigError, match=r"twice as none.*one.*two"):
+    with pytest.raises(ConfigError, match=r"two runs of BC\+H with seed 3.*one.*two"):
         collect([tmp_path], "main", ["*-seed3"])
 
 

@@ -139,6 +139,14 @@ def shard(path: Path, size: int, tag: bytes = b"\x0a", kind: bytes = tarfile.REG
     path.write_bytes(gzip.compress(member.tobuf(tarfile.GNU_FORMAT) + head + bytes(size + 10_240), 1))
 
 
+def headers(path: Path, kind: bytes, text: bytes, times: int) -> None:
+    member = tarfile.TarInfo("x")
+    member.size, member.type = len(text), kind
+    path.write_bytes(
+        gzip.compress(times * (member.tobuf(tarfile.GNU_FORMAT) + text.ljust(512, b"\0")) + bytes(1024))
+    )
+
+
 def check(path: Path) -> None:
     raise check_submission(path).problems[0]
 
@@ -155,6 +163,8 @@ BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str]]
     "a scenario": (lambda to: shard(to, 130 * MIB), check, "a scenario of 136314880 bytes"),
     "another message": (lambda to: shard(to, 50 * MIB, b"\x12"), check, "more than 65536 bytes"),
     "a long name": (lambda to: shard(to, 50 * MIB, kind=LONG), check, "52428800 bytes of a header"),
+    "headers of headers": (lambda to: headers(to, LONG, b"x", 3000), check, "damaged header: .*recursion"),
+    "a map of a header": (lambda to: headers(to, HEADER, b"24 GNU.sparse.map=a,b\n", 1), check, "damaged"),
     "a header": (lambda to: shard(to, 50 * MIB, kind=HEADER), check, "52428800 bytes of a header"),
 }
 

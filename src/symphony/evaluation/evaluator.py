@@ -95,6 +95,8 @@ def evaluate(
     config = EvaluateConfig() if config is None else config
     agent = load_agent(agent, config.device) if isinstance(agent, str) else agent
     if isinstance(data, SceneDataset):
+        if items is not None:
+            raise ConfigError("items are those of a store; these scenes are chosen already")
         dataset = data
     else:
         store = data if isinstance(data, SegmentStore) else SegmentStore(data)

@@ -35,7 +35,12 @@ _USUAL = {
     if field.name not in (*_NAMED, *_MEMORY, "duration", "seed", "metric")
 } | {"score": "discriminator", "goals": "tree"}
 """What goes without saying in the name of an evaluation."""
-_PARTS = ("run", "data", "config", "playback", "constant_velocity", "curvature", "cost")
+_PARTS: dict[str, tuple[str, ...]] = {
+    "run": ("updates", "checkpoint", "named"),
+    "data": ("name", "checksum"),
+    "config": (*_NAMED, *_USUAL, "duration", "seed", "metric"),
+    "cost": ("simulation",),
+} | dict.fromkeys(("playback", "constant_velocity", "curvature"), ())
 """What a kept evaluation must have."""
 
 
@@ -152,9 +157,11 @@ def read_evaluation(file: Path) -> dict[str, Any]:
     record = _read_object(file)
     if (found := record.get("format")) != FORMAT:
         raise DataError(f"format {found!r}, this version reads {FORMAT}", file=file, field="format")
-    for part in _PARTS:
+    for part, names in _PARTS.items():
         if not isinstance(record.get(part), dict):
             raise DataError("is missing", file=file, field=part)
+        if lost := set(names) - record[part].keys():
+            raise DataError("is missing", file=file, field=f"{part}.{min(lost)}")
     return record
 
 
@@ -192,13 +199,19 @@ def find_runs(folders: Iterable[Path]) -> list[Path]:
     """Return every run among folders, each once: a folder is a run or is searched for some, and has one at least."""
     found: dict[Path, Path] = {}
     for folder in folders:
-        runs = [file.parent for file in sorted(folder.rglob("config.json"), key=lambda file: len(file.parts))]
-        if not runs:
+        if not (runs := _runs_below(folder)):
             raise ConfigError(f"{folder} holds no run: none has a config.json")
-        for run in runs:  # what lies in a run is none
-            if not any(parent.resolve() in found for parent in run.parents):
-                found.setdefault(run.resolve(), run)
+        for run in runs:
+            found.setdefault(run.resolve(), run)
     return [found[place] for place in sorted(found)]
+
+
+def _runs_below(folder: Path) -> list[Path]:
+    """The folder itself or the runs in it, links followed; what lies in a run is none."""
+    if (folder / "config.json").is_file():
+        return [folder]
+    inner = sorted(each for each in folder.iterdir() if each.is_dir()) if folder.is_dir() else []
+    return [run for each in inner for run in _runs_below(each)]
 
 
 def _read_object(file: Path) -> dict[str, Any]:

@@ -109,7 +109,11 @@ def report(
         if progress_bar is not None:
             progress_bar(number + 1, len(folder))
     for lost in folder.failures:
-        about = {"segment": lost.segment, "group": lost.group or lost.segment, "failed": lost.failed}
+        about = {
+            "segment": lost.segment,
+            "group": lost.group or lost.segment,
+            "failed": lost.failed or "failed",
+        }
         found.rows += [dict.fromkeys(NUMBERS) | about | {"rollout": k} for k in range(lost.rollouts)]
     return found
 

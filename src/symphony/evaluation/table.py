@@ -25,7 +25,18 @@ METRICS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
 """The paper's; collisions are those at states only, as the paper counts them."""
 _TRAFFIC = ("interactive", "others", "open_traffic", "radius")
 """Settings of an evaluation that decide what agents meet: rows of a table share them."""
-_FREE = ("seed", "data", "validation", "out", "warm_start", "resume", "device", "wandb")
+_FREE = (
+    "seed",
+    "data",
+    "validation.data",
+    "out",
+    "warm_start",
+    "resume",
+    "device",
+    "wandb",
+    "checkpoint_every",
+    "log_every",
+)
 """What may differ between runs of one method: which seed, where things lie."""
 
 
@@ -62,7 +73,8 @@ class Entry:
         where = self.record if where is None else where
         if key == "cost":
             return where[key]["simulation"] / max(1, where["segments"])
-        value = where.get("collision_rate_at_states" if key == "collision_rate" else key, "")
+        key = "collision_rate_at_states" if key == "collision_rate" else key
+        value = where.get(key, "")
         if value is None:  # JSON has no NaN
             return math.nan
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -94,10 +106,10 @@ def collect(
         patterns: names of evaluations; those that the first fitting one fits count (``*`` is anything).
 
     Raises:
-        ConfigError: no runs, or two evaluations of one method, seed and way to simulate.
+        ConfigError: no runs, two of one method and seed, or two evaluations of one of them in one way to simulate.
         DataError: a file can't be read.
     """
-    entries: dict[tuple[str, str, int], Entry] = {}
+    entries, runs = dict[tuple[str, str, int], Entry](), dict[tuple[str, int], Path]()
     left_out: dict[str, list[Path]] = {}
     interactive, seconds = SETTINGS[setting]
     for folder in records.find_runs(folders):
@@ -119,6 +131,9 @@ def collect(
             left_out.setdefault(reason, []).append(folder)
         for name in names:
             entry = Entry(folder, config, name, kept[name])
+            if (run := runs.setdefault((entry.method, entry.seed), folder)) != folder:
+                two = f"{method_name(entry.method)} with seed {entry.seed}"
+                raise ConfigError(f"two runs of {two}: {run}, {folder}")
             other = entries.setdefault((entry.method, entry.way, entry.seed), entry)
             if other is not entry:
                 what = f"{method_name(entry.method)} with seed {entry.seed} was simulated twice"
@@ -214,9 +229,11 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
     for entry in entries:
         found.setdefault((entry.method, entry.way), []).append(entry)
     methods = [method for method, _ in found]
-    paper: dict[str, Any] = {method: {} for method in methods}
-    for method in paper.keys() & figures.keys():
-        paper[method] = {key: {"mean": mean, "se": error} for key, (mean, error) in figures[method].items()}
+    paper = {
+        method: {key: {"mean": mean, "se": error} for key, (mean, error) in cells.items()}
+        for method, cells in figures.items()
+    }
+    _mark_best([{"method": method} | cells for method, cells in paper.items()])
     rows: list[dict[str, Any]] = []
     for (method, way), mine in found.items():
         row: dict[str, Any] = {"method": method, "way": way if methods.count(method) > 1 else ""}
@@ -224,9 +241,8 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
         row |= {"seeds": [one.seed for one in mine], "evaluations": [one.name for one in mine]}
         for key in keys:
             row[key] = _cell([one.number(key) for one in mine] or [first.baseline(method, key)])
-        rows.append(row | {"paper": paper[method]})
+        rows.append(row | {"paper": paper.get(method, {})})
     _mark_best(rows)
-    _mark_best([{"method": method} | cells for method, cells in paper.items() if cells])
     interactive, seconds = SETTINGS[setting]
     about = {"setting": setting, "interactive": interactive, "duration": seconds, "paper": dataset}
     return about | {"columns": keys, "rows": rows, "notes": _notes(entries, dataset)}
@@ -277,6 +293,12 @@ def _check_comparable(entries: Sequence[Entry]) -> None:
         raise ConfigError(f"{wrong}, choose with --evaluation: {both[0]}, {both[1]}")
 
 
+def _leaves(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a run by their names, such as ``search.branches``."""
+    parts = ((part, value if isinstance(value, dict) else {"": value}) for part, value in config.items())
+    return {f"{part}.{name}".rstrip("."): value for part, values in parts for name, value in values.items()}
+
+
 def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
     """What else must be known to read a table."""
     record = entries[0].record
@@ -293,10 +315,14 @@ def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
         way = f"{entry.way}, {entry.record['config']['rollouts']} rollouts"
         ways.setdefault(way, {})[method_name(entry.method)] = None
     notes += [f"simulated {way}: {', '.join(methods)}" for way, methods in ways.items()]
+    every = {entry.way for entry in entries}
     for method in dict.fromkeys(entry.method for entry in entries):
-        mine = [entry.config for entry in entries if entry.method == method]
+        mine = [_leaves(entry.config) for entry in entries if entry.method == method]
         names = dict.fromkeys(name for config in mine for name in config if name not in _FREE)
         differing = [name for name in names if len({json.dumps(config.get(name)) for config in mine}) > 1]
+        seeds = {way: sorted(e.seed for e in entries if (e.method, e.way) == (method, way)) for way in every}
+        if len(set(map(tuple, filter(None, seeds.values())))) > 1:
+            differing.append("the ways that seeds are simulated")
         if differing:
             notes.append(f"runs of {method_name(method)} differ in {', '.join(differing)}")
     for entry in entries:

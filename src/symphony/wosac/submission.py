@@ -29,17 +29,14 @@ from symphony.wosac.scorer import SimulatedRollouts
 from symphony.wosac.scorer.config import CURRENT, FUTURE, ROLLOUTS
 from symphony.wosac.scorer.scenario import STATES, check_agents
 
-SIM_AGENTS = 1
-"""Type of the submission."""
+SIM_AGENTS = 1  # type of the submission
 FIELDS = dict(zip(STATES, ("center_x", "center_y", "center_z", "heading"), strict=True))
 """Field of the message that holds each array."""
 
 _PARAMETERS = re.compile(r"\d+(\.\d+)?[KMBT]?")
 _SHARD = re.compile(r".+\.binproto-(\d{5})-of-(\d{5})")
-_SCENARIO_TAG = b"\x0a"
-"""What comes before a scenario on the wire of a shard: field 1, of a length that follows."""
-_LARGEST = 128 << 20
-"""Bytes of the rollouts of a scenario: of more than 3 000 agents."""
+_SCENARIO_TAG = b"\x0a"  # before a scenario on the wire of a shard: field 1, of a length that follows
+_LARGEST = 128 << 20  # bytes of the rollouts of a scenario: of more than 3 000 agents
 _MAX_REST = 1 << 16
 """Bytes of a shard beside the scenarios, and of a member of the archive beside its content: some lines of text."""
 _DAMAGED = (tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError)
@@ -55,7 +52,10 @@ class _Member(tarfile.TarInfo):
         )
         if beside and self.size > _MAX_REST:
             raise tarfile.ReadError(f"{self.size} bytes of a header")
-        return super()._proc_member(archive)  # type: ignore[misc]
+        try:
+            return super()._proc_member(archive)  # type: ignore[misc]
+        except (ValueError, RecursionError) as error:
+            raise tarfile.ReadError(f"a damaged header: {error}") from error
 
     def _proc_gnusparse_10(self, *_: object) -> None:
         raise tarfile.ReadError("a sparse file")  # whose map is as long as it says
