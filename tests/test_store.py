@@ -376,6 +376,15 @@ def test_records_that_contradict_themselves(filled: Path, field: str, value: Any
         SegmentStore(filled).verify()
 
 
+def test_an_index_that_goes_back_is_refused(filled: Path) -> None:
+    records = np.fromfile(index := SEGMENTS.index_path(filled), SEGMENTS.record)
+    for field, row, change in (("count", 0, -9), ("begin", 1, -9), ("count", 1, 9)):
+        records[field][row] += change
+    index.write_bytes(records.tobytes())
+    with pytest.raises(DataError, match="do not follow one another"):
+        SegmentStore(filled)
+
+
 def test_an_index_that_was_cut_short_is_recognised(filled: Path) -> None:
     with StoreWriter(filled, append=True) as writer:
         writer.write_report({"converted": 3})

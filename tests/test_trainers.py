@@ -70,11 +70,14 @@ def test_the_same_seed_gives_the_same_weights(run: Path, store: Path, tmp_path: 
     assert not same_weights(weights(run), weights(train(config(store, tmp_path / "other", seed=1))))
 
 
-def test_a_run_is_not_overwritten_nor_resumed_as_another(run: Path, store: Path) -> None:
+def test_a_run_is_not_overwritten_nor_resumed_as_another(run: Path, store: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="holds a run already"):
         train(config(store, run))
     with pytest.raises(ConfigError, match=r"another seed \(was \d+\)$"):
         train(config(store, run, resume=True, seed=5))
+    fill(tmp_path / "other", [crossing(5)])
+    with pytest.raises(DataError, match="not the run segments"):
+        train(config(tmp_path / "other", run, resume=True))
 
 
 def test_a_recipe_of_ones_own_may_leave_the_policy_as_it_is(store: Path, tmp_path: Path) -> None:

@@ -142,15 +142,15 @@ def shard(path: Path, size: int, tag: bytes = b"\x0a", kind: bytes = tarfile.REG
 def headers(path: Path, kind: bytes, text: bytes, times: int) -> None:
     member = tarfile.TarInfo("x")
     member.size, member.type = len(text), kind
-    path.write_bytes(
-        gzip.compress(times * (member.tobuf(tarfile.GNU_FORMAT) + text.ljust(512, b"\0")) + bytes(1024))
-    )
+    header = member.tobuf(tarfile.GNU_FORMAT) + text.ljust(512, b"\0")
+    path.write_bytes(gzip.compress(times * header + tarfile.TarInfo("a").tobuf() + bytes(1024)))
 
 
 def check(path: Path) -> None:
     raise check_submission(path).problems[0]
 
 
+SPARSE = b"22 GNU.sparse.major=1\n22 GNU.sparse.minor=0\n"
 MIB, LONG, HEADER = 1 << 20, tarfile.GNUTYPE_LONGNAME, tarfile.XHDTYPE
 BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str]] = {
     "its header": (lambda to: npz(to, {"x": ((10**13,), 16)}), read_rollouts, "field x.* by its header"),
@@ -165,6 +165,7 @@ BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str]]
     "a long name": (lambda to: shard(to, 50 * MIB, kind=LONG), check, "52428800 bytes of a header"),
     "headers of headers": (lambda to: headers(to, LONG, b"x", 3000), check, "damaged header: .*recursion"),
     "a map of a header": (lambda to: headers(to, HEADER, b"24 GNU.sparse.map=a,b\n", 1), check, "damaged"),
+    "sparse": (lambda to: headers(to, HEADER, SPARSE, 1), check, "a sparse file"),
     "a header": (lambda to: shard(to, 50 * MIB, kind=HEADER), check, "52428800 bytes of a header"),
 }
 

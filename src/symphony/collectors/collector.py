@@ -79,8 +79,8 @@ class BeamSearchCollector(Collector):
         rule_noise: Callable[[TensorDictBase, int], Tensor] | None = None,
         **kwargs: Any,
     ) -> None:
-        if keep_tree and leaves != branches:
-            raise ValueError(f"keep_tree needs leaves={branches}, as many as branches; leaves is {leaves}")
+        if not 1 <= (1 if leaves is None else leaves) <= branches or (keep_tree and leaves != branches):
+            raise ValueError(f"leaves must be 1 ... {branches} branches, keep_tree needs all, is {leaves}")
         if kwargs.get("split_trajs") or not kwargs.get("extend_buffer", True):
             raise ValueError("a search has no single steps: neither split_trajs nor extend_buffer=False")
         # Multi-process collectors pass their own choice; here each batch is made anew, from a reset.

@@ -39,10 +39,8 @@ class Aggregate:
     agents: Literal["sum", "max", "mean"] = "sum"
 
     def __post_init__(self) -> None:
-        if self.time not in ("max", "mean", "sum", "last"):
-            raise ValueError(f"time is one of max, mean, sum, last, not {self.time!r}")
-        if self.agents not in ("sum", "max", "mean"):
-            raise ValueError(f"agents is one of sum, max, mean, not {self.agents!r}")
+        if self.time not in (known := ("max", "mean", "sum", "last")) or self.agents not in known[:3]:
+            raise ValueError(f"time is one of {known}, agents of {known[:3]}: {self.time!r}, {self.agents!r}")
 
     def __call__(
         self, scores: Float[Tensor, "*b S T N"], alive: Bool[Tensor, "*b S T _"] | None = None
@@ -388,7 +386,7 @@ def _log_mean(log_weights: Float[Tensor, "*b S"]) -> Float[Tensor, "*b"]:
 
 def _groups(start: TensorDictBase, key: NestedKey) -> Int[Tensor, "*b S"]:
     """The group of each branch: its number, or the first branch that agrees with it in all of its numbers."""
-    value = start.get(key, torch.zeros(()))  # no entry is as wrong as one of another kind
+    value = start.get(key, torch.zeros(()))
     if value.is_floating_point() or value.shape[: start.ndim] != start.shape or value.ndim > start.ndim + 1:
         raise ValueError(f"{key!r} in the start state must be integers, one or some per branch")
     if value.ndim == start.ndim:
@@ -402,16 +400,18 @@ def checked(
     noise: Tensor | None = None,
     groups: Int[Tensor, "*b S"] | None = None,
 ) -> Int[Tensor, "*b S"]:
-    """The branch each slot goes on from; ValueError if a rule returns something else than int64 indices of them."""
+    """The branch each slot goes on from; ValueError if a rule fails or returns anything but int64 indices of them."""
+    own = isinstance(rule, KeepAll | KeepBest | Resampling | ReplaceBad)
     try:
         parents = rule(totals, noise, groups) if takes_groups(rule) else rule(totals, noise)
+        what = f"{parents.dtype} {tuple(parents.shape)}"
     except Exception as error:  # whatever a rule of others raises
+        if own or isinstance(error, torch.OutOfMemoryError):
+            raise
         raise ValueError(f"{rule}: {type(error).__name__}: {error}") from error
     if parents.dtype != torch.int64 or parents.shape != totals.shape:
-        what = f"{parents.dtype} {tuple(parents.shape)}"
         raise ValueError(f"a pruning rule must return int64 {tuple(totals.shape)}, {rule} returned {what}")
     # Looking at the values waits for the device; only rules of others need it.
-    own = isinstance(rule, KeepAll | KeepBest | Resampling | ReplaceBad)
     if not own and parents.numel() and not bool(((parents >= 0) & (parents < totals.shape[-1])).all()):
         raise ValueError(f"{rule} returned branches outside of 0 ... {totals.shape[-1] - 1}")
     return parents
