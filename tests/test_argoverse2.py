@@ -119,7 +119,9 @@ def test_a_missing_map_and_a_file_under_another_scenarios_name(tmp_path: Path) -
 def test_each_column_is_needed(name: str, tmp_path: Path) -> None:
     columns = scenario()
     good = columns.pop(name)
-    for given_ in ({}, {name: [*good[:-1], None]}, {name: [[1.0]] * len(good)}):
+    other = 1 if isinstance(good[0], str | bool) else True
+    wrong = [[value] * len(good) for value in ([1.0], b"1", other)]
+    for given_ in ({}, *({name: values} for values in ([*good[:-1], None], *wrong))):
         error = read_error("argoverse2", write(tmp_path, columns | given_))
         assert (error.field, error.file) == (name, tmp_path / f"scenario_{NAME}.parquet")
 
@@ -194,12 +196,14 @@ def test_maps_without_a_part(name: str, tmp_path: Path) -> None:
     ("keys", "value", "kind"),
     [
         (LANE, 3, NO_LANE),
-        ((*LANE, "id"), "11", NO_LANE),
+        ((*LANE, "id"), True, NO_LANE),
         ((*LANE, "lane_type"), [], NO_LANE),
         ((*LANE, "successors"), ..., NO_LANE),
         ((*LANE, "predecessors"), [2**63], NO_LANE),
         (LEFT, [{"x": 1.0, "y": float("nan")}], NO_LANE),
         (LEFT, [{"x": 10**400, "y": 2}], NO_LANE),
+        (LEFT, [{"x": "7", "y": 2}], NO_LANE),
+        (LEFT, {}, NO_LANE),
         (("drivable_areas", "1", "area_boundary"), points([(0, 0), (1, 1)]), NO_AREA),
         (("pedestrian_crossings", "5", "edge2"), points([(0, 0)]), NO_CROSSING),
     ],

@@ -494,6 +494,8 @@ def test_what_is_in_the_way_is_told(paths: list[Path], tmp_path: Path) -> None:
     with pytest.raises(DataError, match="unfinished conversion to that name: delete one of them"):
         convert(FakeReader(), paths, out)
     shutil.rmtree(out)
-    (partial / "job.json").write_text('{"files": [1]}')
-    with pytest.raises(DataError, match="not the job of a conversion"):
-        convert(FakeReader(), paths, out)
+    job = json.loads((partial / "job.json").read_text())
+    for wrong in ({"files": [1]}, *(job | {part: 7} for part in job), job | {"changed": {"a": None}}):
+        (partial / "job.json").write_text(json.dumps(wrong))
+        with pytest.raises(DataError, match="not the job of a conversion"):
+            convert(FakeReader(), paths, out)

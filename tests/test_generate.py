@@ -88,6 +88,21 @@ def test_bad_plans_name_the_field() -> None:
 
 
 @pytest.mark.usefixtures("fake")
+def test_one_that_was_finished_before_its_lock_was_taken(tmp_path: Path, monkeypatch: Any) -> None:
+    plan, begun, looks = Plan(5), generation._begun, [0]
+    state = generate(plan, tmp_path / "store")
+    before = SegmentStore(tmp_path / "store").checksum()
+
+    def at_first_not(*args: Any) -> Any:
+        looks[0] += 1
+        return dataclasses.replace(begun(*args), complete=looks[0] > 1)
+
+    monkeypatch.setattr(generation, "_begun", at_first_not)
+    assert generate(plan, tmp_path / "store") == state
+    assert (looks, SegmentStore(tmp_path / "store").checksum()) == ([2], before)
+
+
+@pytest.mark.usefixtures("fake")
 def test_an_interrupted_store_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = Plan(23, seed=4)
     whole = generate(plan, tmp_path / "whole")

@@ -319,6 +319,20 @@ def test_one_float_that_changed_is_noticed_where_it_is_read(filled: Path) -> Non
         assert (caught.value.file, caught.value.segment) == (filled, "straight-2")
 
 
+@pytest.mark.parametrize("column", ["segment_id", "source", "file", "tags"])
+def test_text_that_is_none_is_refused_and_never_replaced(tmp_path: Path, column: str) -> None:
+    with StoreWriter(tmp_path) as writer:
+        for seed in range(2):
+            writer.append(crossing(seed=seed).replace(file="log"), tags={"seed": seed})
+    store, whole = SegmentStore(tmp_path), {"segment_id": "ids", "source": "sources", "tags": "groups"}
+    path = tmp_path / "columns" / f"{column}.bin"
+    change(path, path.stat().st_size // 2, b"\xff")
+    for read in (lambda: store[1], lambda: getattr(store, whole[column]) if column in whole else store[1]):
+        with pytest.raises(DataError, match="not UTF-8") as caught:
+            read()
+        assert (caught.value.file, caught.value.segment, caught.value.field) == (tmp_path, "number 1", column)
+
+
 def test_every_changed_byte_is_noticed(tmp_path: Path) -> None:
     fill(tmp_path / "store", unlike(3))
     rng = np.random.default_rng(0)

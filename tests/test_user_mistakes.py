@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,16 @@ import numpy as np
 import pytest
 import torch
 
+from helpers_losses import spec
 from helpers_runs import tiny
 from helpers_segments import crossing
 from helpers_store import fill
 from symphony.agents import load_agent
+from symphony.agents.agent import build_agent
 from symphony.cli import ALL_FAILED, main
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
+from symphony.errors import ConfigError
 from symphony.planners.identity import source_of
 from symphony.recipes import train
 from symphony.rollouts.crowd import crowd_dataset
@@ -212,15 +216,26 @@ def test_what_a_planner_does_wrong_ends_its_run_only(store: Path, told: Any, bod
         ("--device foo", "unknown device 'foo'"),
         *((f"--planner exits{end}:plan", "SystemExit") for end in ("", ".py")),
         *((f"--planner wrong{end}:plan", "SyntaxError") for end in ("", ".py")),
+        ("--search tree --rule math:sqrt", "can't be called as needed"),
     ],
 )
 def test_one_line_names_the_mistake(store: Path, told: Any, words: str, message: str) -> None:
     Path("exits.py").write_text("exit()\n")
     Path("wrong.py").write_text("def plan(:\n")
-    agent = "pretrained:bc_ts_h" if "foo" in words.split()[-1:] else "constant_velocity"
+    agent = "pretrained:bc_ts_h" if {"foo", "--rule"} & {*words.split()} else "constant_velocity"
     code, printed = told(*drive(store, "--out", "a", *words.split(), agent=agent))
     assert code in (1, 2)
     assert (message in printed, "error:" in printed, "Traceback" in printed) == (True, True, False)
+
+
+@pytest.mark.parametrize("part", ["policy", "encoder", "network"])
+def test_own_networks_that_can_not_be_called(part: str) -> None:
+    found = spec("bicycle")
+    own = found.discriminator if part == "network" else found.agent
+    own = replace(own, **{part: "math:sqrt"})
+    found = replace(found, **{"discriminator" if part == "network" else "agent": own})
+    with pytest.raises(ConfigError, match="'math:sqrt' can't be called as needed"):
+        build_agent("own", found)
 
 
 def test_planners_that_did_not_meet_the_same_are_not_compared(store: Path, told: Any) -> None:

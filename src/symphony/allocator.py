@@ -16,12 +16,10 @@ def tune() -> bool:
     """Set the allocator of this process, before its first large tensor; return whether it was set."""
     if (library := _ours()) is None:
         return False
-    trim_threshold, top_pad, mmap_threshold = -1, -2, -3
+    trim, pad, mapping = -1, -2, -3  # M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD
     # Older versions take no mapping threshold above 32 MiB.
-    mapped = library.mallopt(mmap_threshold, 1 << 30) or library.mallopt(mmap_threshold, 1 << 25)
-    return bool(
-        mapped and library.mallopt(trim_threshold, (1 << 31) - 1) and library.mallopt(top_pad, 1 << 26)
-    )
+    mapped = library.mallopt(mapping, 1 << 30) or library.mallopt(mapping, 1 << 25)
+    return bool(mapped and library.mallopt(trim, (1 << 31) - 1) and library.mallopt(pad, 1 << 26))
 
 
 def release() -> bool:
@@ -35,9 +33,7 @@ def release() -> bool:
 
 def _ours() -> ctypes.CDLL | None:
     """The C library, if it is glibc and nobody has said how it shall keep memory."""
-    said = not {f"MALLOC_{name}_" for name in ("TRIM_THRESHOLD", "TOP_PAD", "MMAP_THRESHOLD")}.isdisjoint(
-        os.environ
-    )
-    said |= os.environ.get("SYMPHONY_MALLOPT", "1") in {"", "0"}
+    names = {f"MALLOC_{name}_" for name in ("TRIM_THRESHOLD", "TOP_PAD", "MMAP_THRESHOLD")}
+    said = bool(names & os.environ.keys()) or os.environ.get("SYMPHONY_MALLOPT", "1") in {"", "0"}
     glibc = platform.system() == "Linux" and platform.libc_ver()[0] == "glibc"
     return ctypes.CDLL(None) if glibc and not said else None

@@ -8,6 +8,7 @@ import math
 import os
 import re
 import socket
+import sys
 import weakref
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
@@ -102,7 +103,9 @@ class Lock(AbstractContextManager["Lock"]):
         with naming(path):
             self._file = self._taken()
             os.ftruncate(self._file, 0)
-            os.pwrite(self._file, f"{os.getpid()} on {socket.gethostname()}".encode(), 0)
+            program = Path(sys.argv[0]).name.replace("__main__.py", "symphony")
+            who = f"{os.getpid()} on {socket.gethostname()}: {' '.join([program, *sys.argv[1:2]])}"
+            os.pwrite(self._file, who.encode(errors="replace"), 0)
         self.close = weakref.finalize(self, _release, path, self._file, os.getpid())
 
     def _taken(self) -> int:

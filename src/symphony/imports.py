@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Callable
 from importlib.util import module_from_spec, spec_from_file_location
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,8 @@ def load_object(path: str, *, here: bool = True) -> Any:
     """Import ``module:name``, or ``path/to/file.py:name``, with what lies beside the file to import.
 
     Unless ``here`` is False, modules are looked for in the current folder, too, as ``python -m`` does. Not for paths
-    that the user did not type: whatever lies in the folder would run.
-
-    Raises:
-        ConfigError: if there is no such module, file or name, or it can't be imported.
+    that the user did not type: whatever lies in the folder would run. A :class:`ConfigError` says what is not there,
+    or why it can't be imported.
     """
     module, _, name = path.rpartition(":")
     load = _file if module.endswith(".py") else importlib.import_module
@@ -33,14 +32,20 @@ def load_object(path: str, *, here: bool = True) -> Any:
                 raise
             sys.path.append(os.getcwd())
             found = load(module)
-        for part in name.split("."):
-            found = getattr(found, part)
+        return attrgetter(name)(found)
     except (Exception, SystemExit) as error:  # whatever a user's module raises
         usual = isinstance(error, ImportError | AttributeError | ValueError)
-        raise ConfigError(
-            f"can't import '{path}': {'' if usual else f'{type(error).__name__}: '}{error}"
-        ) from error
-    return found
+        kind = "" if usual else f"{type(error).__name__}: "
+        raise ConfigError(f"can't import '{path}': {kind}{error}") from error
+
+
+def build_object(path: str, *arguments: Any, **named: Any) -> Any:
+    """Call what an import path names; a :class:`ConfigError` if it can't be imported or called so."""
+    found = load_object(path)
+    try:
+        return found(*arguments, **named)
+    except TypeError as error:
+        raise ConfigError(f"'{path}' can't be called as needed: {error}") from error
 
 
 def _file(name: str) -> Any:

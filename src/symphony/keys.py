@@ -45,8 +45,7 @@ GAP_AHEAD: Key = ("agents", "observation", "gap_ahead")  # [..., N, O, H]: at ti
 ALONG: Key = ("agents", "observation", "along")  # [..., N, O, Fa]: along the route
 LIGHTS: Key = ("agents", "observation", "lights")  # [..., N, L, Fp]: nearest, as points
 LIGHTS_MASK: Key = ("agents", "observation", "lights_mask")
-# [..., N, 5]: signed distance of box centre and corners to the edge of the road, metres, positive off it.
-ROAD: Key = ("agents", "observation", "road")
+ROAD: Key = ("agents", "observation", "road")  # [..., N, 5]: metres off the road (signed), centre and corners
 SEEN: tuple[Key, ...] = (OWN, OBJECTS, POINTS, ROUTE, GAP, GAP_AHEAD, ALONG, LIGHTS, ROAD)
 """What an agent observes and could react to."""
 

@@ -103,10 +103,8 @@ def _ahead(submit: Callable[[T], Any], tasks: Iterator[T], count: int) -> Iterat
         pending.extend(map(submit, itertools.islice(tasks, 1)))
 
 
-def _local_map(
-    function: Callable[[T], R], tasks: Iterator[T], workers: int, imports: list[str]
-) -> Results[R]:
-    get_ready(imports)
+def _local_map(function: Callable[[T], R], tasks: Iterator[T], workers: int, names: list[str]) -> Results[R]:
+    get_ready(names)
     context = multiprocessing.get_context(_START)
     lifeline, ours = context.Pipe(duplex=False)
     environment = {**os.environ, **WORKER_ENVIRONMENT}  # a server keeps that which it was started with

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from symphony.config import AgentConfig, AgentSpec
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
 from symphony.envs.routes import ALONG_FEATURES, CHOICE_FEATURES, ROUTE_FEATURES, TURN_FEATURES
-from symphony.imports import load_object
+from symphony.imports import build_object
 from symphony.modules.encoder import FORESIGHT, ElementGroup, SceneEncoder
 
 RADIUS = 20.0
@@ -70,7 +71,7 @@ def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     """Actions from observations, and from the route that is the goal: a categorical over the joint actions of the
     bicycle, or a Gaussian or a histogram over displacements. Seed torch beforehand.
     """
-    policy = load_object(spec.agent.policy)(spec) if spec.agent.policy != "paper" else _policy(spec)
+    policy = build_object(spec.agent.policy, spec) if spec.agent.policy != "paper" else _policy(spec)
     if spec.agent.persona:
         # What personas are drawn from travels with the weights that were trained on them.
         policy.register_buffer("personas", torch.zeros(PERSONAS, 2))
@@ -105,7 +106,7 @@ def discriminator_network(spec: AgentSpec) -> TensorDictModule:
     if config is None:
         raise ValueError("the specification has no discriminator")
     if config.network != "paper":
-        return load_object(config.network)(spec)
+        return build_object(config.network, spec)
     return modules.discriminator(
         _own_features(spec),
         OBJECT_FEATURES,
@@ -127,4 +128,4 @@ def _own_features(spec: AgentSpec) -> int:
 
 
 def _encoder(spec: AgentSpec) -> Any:
-    return SceneEncoder if spec.agent.encoder == "paper" else load_object(spec.agent.encoder)
+    return SceneEncoder if spec.agent.encoder == "paper" else partial(build_object, spec.agent.encoder)

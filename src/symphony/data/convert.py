@@ -191,9 +191,13 @@ def read_job(folder: Path) -> Job | None:
     if not path.is_file():
         return None
     try:
-        return Job(**store_format.read_json(path))
+        job = Job(**store_format.read_json(path))
+        sound = [*map(type, vars(job).values())] == [dict, list, dict]
+        if not sound or not all(type(time) is int for time in job.changed.values()):
+            raise TypeError("parts of other types")
     except TypeError as error:
         raise DataError("not the job of a conversion, or of another release", file=path) from error
+    return job
 
 
 def folder_of(out: Path) -> Path:

@@ -237,6 +237,8 @@ def generate(
         return state
     with StoreWriter(out, append=True) as writer:
         state = _begun(SegmentStore(out), settings)
+        if state.complete:  # another run went on with it in between
+            return state
         _report(writer, settings, state)
         barren = 0
         tasks = plan.networks(state.networks)

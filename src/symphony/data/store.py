@@ -97,7 +97,7 @@ class SegmentStore(Sequence[RunSegment]):
         record, parts = self.raw(SEGMENTS, row)
         agents, steps, lights = len(parts["agent_id"]), int(record["steps"]), len(parts["signal_lane"])
         for name in ("segment_id", "source", "file"):
-            parts[name] = _text(parts[name])
+            parts[name] = self._text(parts[name], row, name)
         parts["group"] = _group(self._parsed(row, parts.pop("tags")), parts["segment_id"])
         for name in ("position", "heading", "velocity", "valid"):
             parts[name] = parts[name].reshape(agents, steps, *parts[name].shape[1:])
@@ -194,7 +194,14 @@ class SegmentStore(Sequence[RunSegment]):
     def _texts(self, column: str) -> list[str]:
         axis, data = SEGMENTS.axes[column], self._columns[column].tobytes()
         ends = [0, *np.cumsum(self._segments["count"][:, axis]).tolist()]
-        return [_text(data[a:b]) for a, b in pairwise(ends)]
+        return [self._text(data[a:b], row, column) for row, (a, b) in enumerate(pairwise(ends))]
+
+    def _text(self, data: Any, row: int, field: str) -> str:
+        try:
+            return bytes(data).decode()
+        except UnicodeDecodeError as error:
+            message, name = f"damaged: not UTF-8 ({error})", f"number {row}"
+            raise DataError(message, file=self.path, segment=name, field=field) from error
 
     @cached_property
     def _places(self) -> dict[str, int]:
@@ -217,7 +224,7 @@ class SegmentStore(Sequence[RunSegment]):
 
     def _parsed(self, row: int, tags: Any) -> dict[str, Any]:
         try:
-            found = json.loads((tags if isinstance(tags, str) else _text(tags)) or "{}")
+            found = json.loads((tags if isinstance(tags, str) else self._text(tags, row, "tags")) or "{}")
             if not isinstance(found, dict):
                 raise ValueError("no object")
         except (ValueError, RecursionError) as error:
@@ -292,11 +299,6 @@ class SegmentStore(Sequence[RunSegment]):
             "map_points": _span(points[segments["map"]]),
             "bytes": sum(file.stat().st_size for file in self.path.rglob("*") if file.is_file()),
         }
-
-
-def _text(data: Any) -> str:
-    """Text of bytes. What a damaged store has instead of it does not have the hash of its segment."""
-    return bytes(data).decode(errors="replace")
 
 
 def _group(tags: dict[str, Any], segment_id: str) -> str:

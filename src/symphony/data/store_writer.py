@@ -118,7 +118,7 @@ class StoreWriter:
         return number
 
     def write_report(self, report: Mapping[str, Any]) -> None:
-        """Replace the conversion report kept with the store."""
+        """Replace the conversion report kept with the store; its values are what JSON can hold."""
         write_json(self.path / layout.REPORT, report)
 
     def close(self) -> None:

@@ -23,7 +23,7 @@ from symphony.data.store import SegmentStore
 from symphony.envs.objects import rollout_heights
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
-from symphony.imports import load_object
+from symphony.imports import build_object, load_object
 from symphony.learning.demonstrations import SceneDataset
 from symphony.learning.experts import logged, logged_heights
 from symphony.metrics import Choice, RolloutMetrics, choices, collision_kinds, route_turns
@@ -184,7 +184,7 @@ class _BatchEvaluator:
         evaluated = rollouts.counted & ~scenes.background[:, None, None]
         exists = log_valid[:, None] if as_logged else existing(scenes, rollouts)
         for path in evaluation.config.metric:
-            values = load_object(path)(scenes, rollouts)
+            values = build_object(path, scenes, rollouts)
             if values.shape != rollouts.state.shape[:2]:
                 shape = tuple(rollouts.state.shape[:2])
                 raise ConfigError(f"metric '{path}' must give {shape} numbers, gives {tuple(values.shape)}")

@@ -28,7 +28,7 @@ from symphony.config import Score, SearchConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.flags import collision_flags
 from symphony.errors import ConfigError
-from symphony.imports import load_object
+from symphony.imports import build_object
 from symphony.learning.demonstrations import SceneDataset
 from symphony.modules import SeededNoise
 from symphony.rollouts.unroll import draw_goals
@@ -65,7 +65,7 @@ def pruning_rule(config: SearchConfig) -> PruningRule:
         return KeepBest(0.5)
     if config.rule == "systematic":
         return Systematic(config.temperature)
-    return ReplaceBad(config.threshold) if config.rule == "replace" else load_object(config.rule)()
+    return ReplaceBad(config.threshold) if config.rule == "replace" else build_object(config.rule)
 
 
 def flag_score(state: TensorDictBase) -> Float[Tensor, "*b N"]:

@@ -19,7 +19,6 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
-import operator
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -165,6 +164,11 @@ def _column(pa: Any, column: Any, name: str) -> NDArray[Any]:
     if column.null_count or not len(column):
         raise DataError(f"{column.null_count} of {len(column)} values are missing", field=name)
     try:
+        # What Arrow would convert, such as a text to a number or a number to a text, is another column.
+        kind, of = getattr(column.type, "value_type", column.type), pa.types
+        others = {"string": of.is_string(kind) or of.is_large_string(kind), "bool": of.is_boolean(kind)}
+        fits = others.get(_COLUMNS[name], of.is_integer(kind) or of.is_floating(kind))
+        refuse(not fits, f"expected {_COLUMNS[name]}, is {column.type}", name)
         if name not in _TEXTS:
             return column.cast(_COLUMNS[name]).to_numpy()
         coded = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
@@ -344,11 +348,15 @@ def _is_cut(ring: Doubles) -> Bools:
 
 
 def _id(value: Any) -> int:
-    return int(np.int64(operator.index(value)))  # raises where it is no integer, or has more than 64 bits
+    refuse(type(value) is not int, f"{str(value)[:40]!r} is no id")
+    return int(np.int64(value))  # raises where it has more than 64 bits
 
 
 def _points(points: list[Any]) -> Doubles:
     """Return [P, 2] the x and y of a list of points."""
-    found = np.array([(point["x"], point["y"]) for point in points], np.float64).reshape(len(points), 2)
+    rows = [(point["x"], point["y"]) for point in points]
+    wrong = type(points) is not list or any(type(n) not in {int, float} for row in rows for n in row)
+    refuse(wrong, "not a list of points with the numbers x and y")
+    found = np.array(rows, np.float64).reshape(len(rows), 2)
     refuse(not (np.abs(found) <= MAX_COORDINATE).all(), "a coordinate that is not finite or absurdly large")
     return found

@@ -71,17 +71,26 @@ def read_rows(path: Path) -> Rows:
     with located(file=path, field="a line"), path.open("rb") as file:
         head = file.readline()
         refuse(not head.strip(), "the file is empty")
-        names = [name.strip() for name in head.decode("ascii").rstrip("\r\n").split(",")]
+        names = [name.strip() for name in _ascii(head, 1).rstrip("\r\n").split(",")]
         for name in NEEDED:
             refuse(names.count(name) != 1, f"{names.count(name)} columns of that name, expected one", name)
         parts, first = [], 2
         while lines := list(itertools.islice(file, CHUNK)):
             whole = lines[-1].endswith(b"\n")
             refuse(not whole, "the last line is not complete: the file was cut short", "last line")
-            parts.append(_rows(names, b"".join(lines).decode("ascii"), first))
+            parts.append(_rows(names, _ascii(b"".join(lines), first), first))
             first += len(lines)
         refuse(not parts, "the file has no rows")
         return joined(*parts)
+
+
+def _ascii(data: bytes, first: int) -> str:
+    """Return the text of some lines of a file, of which the first has that number."""
+    try:
+        return data.decode("ascii")
+    except UnicodeDecodeError as error:
+        line = first + data.count(b"\n", 0, error.start)
+        raise DataError("not ASCII text", field=f"line {line}") from error
 
 
 def joined(*parts: Rows) -> Rows:
@@ -133,7 +142,10 @@ def _number_or_none(text: str) -> float:
 
 
 def _whole(text: str) -> int:
-    return int(_number(text, 2.0**53))
+    value = _number(text, 2.0**53)
+    if not value.is_integer():
+        raise ValueError(text)
+    return int(value)
 
 
 def _track_id(text: str) -> int:

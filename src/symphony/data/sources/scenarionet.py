@@ -85,11 +85,10 @@ class ScenarioNetReader(Reader):
 def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
     with located(field="metadata"):
         metadata = scenario["metadata"]
-        times = np.asarray(metadata["ts"].value).astype(np.float64)
+        times = _numbers(metadata["ts"], "ts", scenario["length"], 1)[:, 0]
         steps, ego, dataset = len(times), metadata["sdc_id"], str(metadata.get("dataset", ""))
         place, date = metadata.get("map"), metadata.get("date", metadata.get("log_name"))
-        if times.ndim != 1 or scenario["length"] != steps or not 2 <= steps <= MAX_STEPS:
-            raise DataError(f"{times.shape} times for {str(scenario['length'])[:20]} steps")
+        refuse(not 2 <= steps <= MAX_STEPS, f"{steps} steps, expected 2 … {MAX_STEPS}")
         dt = base.time_step(times, "metadata: ts")
     names, kinds, states, valid = _tracks(scenario, steps)
     refuse(ego not in names, "names no track that is valid at some step", "metadata: sdc_id")
@@ -129,16 +128,28 @@ def _tracks(scenario: Mapping[Any, Any], steps: int) -> tuple[list[str], list[in
         check_counts(len(tracks), steps, "tracks")
     for key, track in tracks:
         with located(field=f"tracks {str(key)[:60]}"):
-            parts = [np.asarray(track["state"][name].value, np.float64).reshape(steps, -1) for name in _STATE]
-            parts = [part[:, :width] for part, width in zip(parts, _STATE.values(), strict=True)]
+            state = track["state"]
+            parts = [_numbers(state[name], name, steps, width) for name, width in _STATE.items()]
             valid = parts[0][:, 0] > 0
             states = np.where(valid[:, None], np.concatenate(parts[1:], axis=1), 0.0)
-            refuse(states.shape[1] != 9, f"{states.shape[1]} numbers a step, expected 9")
             if valid.any():
                 found.append((str(key), _TYPES.get(str(track.get("type")), AgentType.OTHER), states, valid))
     refuse(not found, "has no agents", "tracks")
     names, kinds, all_states, masks = zip(*found, strict=True)
     return list(names), list(kinds), np.stack(all_states), np.stack(masks)
+
+
+def _numbers(value: Array, name: str, steps: Any, width: int) -> Doubles:
+    """Return [T, width] from an array of numbers [T, width], or [T] for a width of 1; refuse any other.
+
+    More numbers than one a step may be followed by others: a height, where only x and y are asked for.
+    """
+    found = value.value
+    columns = found.shape[1] if found.ndim == 2 else 2 - found.ndim
+    fits = columns >= width > 1 or columns == width == 1
+    fits &= found.dtype.kind in "bfiu" and found.shape[:1] == (steps,)
+    refuse(not fits, f"{name}: {found.dtype} {found.shape} for {width} numbers at {str(steps)[:20]} steps")
+    return found.astype(np.float64).reshape(-1, columns)[:, :width]
 
 
 def _sizes(sizes: Doubles, valid: Bools, ego: int) -> Floats:
@@ -362,6 +373,7 @@ def _points(value: Any) -> Doubles:
             raise DataError("not a list of points")
         found = np.array(rows, np.float64)
     else:
+        refuse(value.value.dtype.kind not in "bfiu", f"{value.value.dtype}, expected points")
         found = value.value.astype(np.float64)
     if found.size == 0:
         return np.zeros((0, 2))

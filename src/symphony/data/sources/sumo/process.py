@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from symphony import files
 from symphony.data import store_format
 from symphony.errors import DataError
 
@@ -35,8 +34,6 @@ def scratch() -> Iterator[Path]:
 
 def _remove_left(folder: Path) -> None:
     """Remove a folder whose lock nobody holds: its owner is dead, on whichever machine or in which container."""
-    if files.fcntl is None:
-        return
     with contextlib.suppress(OSError, DataError):
         state = folder.lstat()
         mine = stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid()
