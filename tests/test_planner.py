@@ -32,6 +32,7 @@ from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import report
 from symphony.learning.demonstrations import SceneDataset
 from symphony.planners.driver import EgoPlanners
+from symphony.planners.included import IDMPlanner
 from symphony.planners.interface import (
     MAX_ACCELERATION,
     MAX_BRAKING,
@@ -191,16 +192,13 @@ def test_it_steers_a_vehicle_of_its_own_length() -> None:
     assert (turned[-1] - turned[0]) / float(driven) == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("given", "why"),
-    [
-        (lambda _: 1 / 0, "step 3: ZeroDivisionError: division by zero (test_planner.py:"),
-        (lambda _: (float("nan"), 0.0), "step 3: ValueError: a plan that is not finite"),
-        (lambda _: None, "step 3: "),
-        (lambda seen: Pose(seen.ego.x + 50, seen.ego.y, 0.0, 5.0), "a target 50.0 m away"),
-        (lambda seen: seen.route.fill(0), "read-only"),
-    ],
-)
+@pytest.mark.parametrize(("given", "why"), [
+    (lambda _: 1 / 0, "step 3: ZeroDivisionError: division by zero (test_planner.py:"),
+    (lambda _: (float("nan"), 0.0), "step 3: ValueError: a plan that is not finite"),
+    (lambda _: None, "step 3: "),
+    (lambda seen: Pose(seen.ego.x + 50, seen.ego.y, 0.0, 5.0), "a target 50.0 m away"),
+    (lambda seen: seen.route.fill(0), "read-only"),
+])  # fmt: skip
 def test_what_is_odd_fails_the_run_from_there_on(given: Any, why: str) -> None:
     odd = partial(FunctionPlanner, lambda seen: given(seen) if seen.step == 3 else (0.0, 0.0))
     found = simulated(odd, count=1, rollouts=2)
@@ -350,17 +348,15 @@ def test_beside_a_planner_nothing_is_searched_unless_asked_for() -> None:
         assert beside_planner(EvaluateConfig(rollouts=2, **changes)).search == search  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    ("name", "why"),
-    [
-        ("best", "idm, log, an import path"),
-        ("pipe:no_such_command -x", "there is no command 'no_such_command'"),
-        ("no_such.py:plan", "no such file"),
-        ("dataclasses:Field", "can't be made: TypeError"),
-        ("threading:Event", "has no reset and no plan"),
-        (f"{__name__}:Angry", "can't be made: RuntimeError: never"),
-    ],
-)
+@pytest.mark.parametrize(("name", "why"), [
+    ("best", "idm, log, an import path"),
+    ("pipe:no_such_command -x", "there is no command 'no_such_command'"),
+    ("no_such.py:plan", "no such file"),
+    ("dataclasses:Field", "can't be made: TypeError"),
+    ("threading:Event", "has no reset and no plan"),
+    (f"{__name__}:Forgetful", "has no reset"),
+    (f"{__name__}:Angry", "can't be made: RuntimeError: never"),
+])  # fmt: skip
 def test_what_is_no_planner_is_refused(name: str, why: str) -> None:
     with pytest.raises(ConfigError, match=why):
         planner_maker(name)
@@ -369,6 +365,19 @@ def test_what_is_no_planner_is_refused(name: str, why: str) -> None:
 class Angry:
     def __init__(self) -> None:
         raise RuntimeError("never")
+
+
+class Forgetful(IDMPlanner):
+    def plan(self, traffic: Traffic) -> Control:
+        return Control(-1.0, 0.0)
+
+
+class Halting(Forgetful):
+    """No IDM any more, whatever its base and its attributes say."""
+
+    rule = "idm"
+
+    def reset(self, scenario: Scenario) -> None: ...
 
 
 def test_one_that_can_not_begin_fails_all_of_its_run() -> None:
@@ -383,14 +392,14 @@ LIMIT = 14.0
 """Of hand-made roads, m/s."""
 
 
-def driven(segment: RunSegment, planner: str = "idm") -> Simulation:
+def driven(segment: RunSegment, planner: Any = "idm") -> Simulation:
     """The ego by a planner, everyone else as logged."""
     scenes = scene(segment, [segment.ego], LaneGraph(segment.road))
-    egos = EgoPlanners(planner, planner_maker(planner), [segment])
+    egos = EgoPlanners("mine", planner_maker(planner), [segment])
     return simulation(load_agent("playback"), scenes, EvaluateConfig(rollouts=1), egos=egos)
 
 
-def states(segment: RunSegment, planner: str = "idm") -> Any:
+def states(segment: RunSegment, planner: Any = "idm") -> Any:
     """[T + 1, 4] of the ego in a run that did not fail."""
     found = driven(segment, planner)
     assert found.failed == ({},)
@@ -406,6 +415,14 @@ def in_a_row(speeds: list[float], starts: list[float], steps: int = 131, lane: A
     road = make_road([np.stack([line, np.full_like(line, k * LANE_WIDTH)], -1) for k in (0, 1)])
     velocity = np.stack([speed + 0 * x, 0 * x], -1)
     return make_segment(road, np.stack([x, y], -1), 0 * x, velocity)
+
+
+def test_planners_that_build_on_idm_drive_as_they_say() -> None:
+    """By their own parameters, and by their own plan where they have one."""
+    road = in_a_row([14.0, 0.0], [20.0, 130.0])
+    ends = [states(road, partial(IDMPlanner, gap=gap))[-1, 0] for gap in (2.0, 6.0)]
+    assert ends[0] - ends[1] == pytest.approx(4.0, abs=1.0)
+    np.testing.assert_allclose(np.diff(states(road, Halting)[:50, 3]), -0.2, atol=1e-4)
 
 
 @pytest.mark.parametrize("speed", [3.0, 14.0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ from symphony.envs.observation import ObservationConfig
 from symphony.envs.routes import ONWARD, SPACING
 from symphony.errors import ConfigError
 from symphony.planners.calls import SECONDS, answer, plans_of
+from symphony.planners.included import IDMPlanner
 from symphony.planners.interface import Planner, Traffic, checked_plan, fixed, scenario_of
 from symphony.streams import Stream, fold_in
 
@@ -70,7 +71,8 @@ class RuledEgo(TensorDictModuleBase):
 
     Args:
         env: the environment.
-        rule: made with an environment, it writes ``BACKGROUND``.
+        rule: made with an environment and the parameters, it writes ``BACKGROUND``.
+        driver: the parameters, of all egos.
         start: [...] states at which rollouts begin; each names its scene as its planner.
     """
 
@@ -78,14 +80,18 @@ class RuledEgo(TensorDictModuleBase):
     out_keys = [keys.PLANNED]  # noqa: RUF012
 
     def __init__(
-        self, env: DrivingEnv, rule: Callable[[PlannedEnv], TensorDictModuleBase], start: TensorDictBase
+        self,
+        env: DrivingEnv,
+        rule: Callable[[PlannedEnv, IDMPlanner], TensorDictModuleBase],
+        driver: IDMPlanner,
+        start: TensorDictBase,
     ) -> None:
         super().__init__()
         scenes = env.scenes.clone(recurse=False)
         scenes.background = torch.zeros_like(scenes.background).index_fill(
             1, scenes.interactive.new_zeros(1), 1
         )
-        self.rule = rule(PlannedEnv(scenes, env.dynamics, ObservationConfig.nothing()))
+        self.rule = rule(PlannedEnv(scenes, env.dynamics, ObservationConfig.nothing()), driver)
         self.lost = scenes.route_logged[:, 0] < 0
         start.set(keys.PLANNER, start.get(keys.SCENE).clone())
 
@@ -111,6 +117,7 @@ class EgoPolicy(TensorDictModuleBase):
         egos: how egos are planned.
         start: [...] states at which planners begin, the egos on the routes of the log; each gets its number.
         seed: of all rollouts.
+        first: the planner of the first rollout, or the exception that making it ended with.
         forked: a search will copy planners with its branches.
 
     Raises:
@@ -121,7 +128,14 @@ class EgoPolicy(TensorDictModuleBase):
     out_keys = [keys.PLANNED, keys.PLANNER]  # noqa: RUF012
 
     def __init__(
-        self, env: DrivingEnv, egos: EgoPlanners, start: TensorDictBase, seed: int, *, forked: bool = False
+        self,
+        env: DrivingEnv,
+        egos: EgoPlanners,
+        start: TensorDictBase,
+        seed: int,
+        first: Planner | Exception,
+        *,
+        forked: bool = False,
     ) -> None:
         super().__init__()
         self.env, self.egos = env, egos
@@ -137,15 +151,15 @@ class EgoPolicy(TensorDictModuleBase):
             made = scenario_of(
                 egos.segments[row], self._routes[row], state[number], stream[number] & (2**63 - 1)
             )
-            planner = answer(egos.make, seconds=egos.seconds)
+            planner: Any = answer(egos.make, seconds=egos.seconds) if number else first
             error = planner if isinstance(planner, Exception) else None
             error = error or answer(planner.reset, made, seconds=egos.seconds)
             failed = isinstance(error, Exception)
             self._held[number] = Failure(0, f"reset: {_words(error)}") if failed else planner
         self._next = len(scene)
-        first = next((held for held in self._held.values() if not isinstance(held, Failure)), None)
-        if forked and first is not None:
-            self._copy(first)
+        drives = next((held for held in self._held.values() if not isinstance(held, Failure)), None)
+        if forked and drives is not None:
+            self._copy(drives)
 
     def _route(self, row: int) -> NDArray[np.float32]:
         """Points [P, 2] of the route that the ego of a scene takes; none if it is on no lane."""
@@ -258,14 +272,15 @@ def ego_policy(
     egos: EgoPlanners,
     start: TensorDictBase,
     seed: int,
-    rules: Mapping[str, Callable[[PlannedEnv], TensorDictModuleBase]],
+    rule: Callable[[PlannedEnv, IDMPlanner], TensorDictModuleBase],
     *,
     forked: bool = False,
 ) -> EgoPolicy | RuledEgo:
-    """What moves the egos: the rule that a planner's class names, or else planners of their own."""
-    if rule := getattr(egos.make, "rule", ""):
-        return RuledEgo(env, rules[rule], start)
-    return EgoPolicy(env, egos, start, seed, forked=forked)
+    """What moves the egos: a rule with the parameters of an IDM that has no ``plan`` of its own, or planners."""
+    first = answer(egos.make, seconds=egos.seconds)
+    if isinstance(first, IDMPlanner) and not callable(getattr(first, "plan", None)):
+        return RuledEgo(env, rule, first, start)
+    return EgoPolicy(env, egos, start, seed, first, forked=forked)
 
 
 def route_from(route: NDArray[np.float32], progress: float) -> NDArray[np.float64]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -53,7 +52,8 @@ class IDMPlanner:
     It gives no way to crossing traffic that is not on its route yet.
 
     It is not asked step by step: the rule that also drives background traffic moves the egos of all rollouts at once,
-    :class:`symphony.rollouts.background.CarFollower`, with these parameters.
+    :class:`symphony.rollouts.background.CarFollower`, with these parameters. Others are given by
+    ``functools.partial(IDMPlanner, headway=1.0)``; a subclass with ``reset`` and ``plan`` is asked like any planner.
 
     Args:
         speed: v0 in m/s where no speed limit is known.
@@ -65,7 +65,6 @@ class IDMPlanner:
         margin: metres that the corridor is wider than the ego on each side.
     """
 
-    rule: ClassVar[str] = "idm"
     speed: float = 13.9
     headway: float = 1.5
     gap: float = 2.0

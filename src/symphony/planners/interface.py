@@ -169,14 +169,16 @@ def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
 
     Args:
         planner: a class with ``reset`` and ``plan``, a function that makes such objects, or a function from an
-            :class:`~symphony.planners.view.Observation` to a plan; or the name of one: ``idm``, ``log``, an
+            :class:`~symphony.planners.view.Observation` to a plan; what makes an
+            :class:`~symphony.planners.included.IDMPlanner`; or the name of one: ``idm``, ``log``, an
             import path such as ``my.planner:Planner``, a file such as ``my.py:plan``, or ``pipe:COMMAND`` (see
             :mod:`symphony.planners.process`).
 
     Raises:
         ConfigError: there is no such planner, or it has no ``reset`` and ``plan``.
     """
-    from symphony.planners.process import ProcessPlanner  # noqa: PLC0415 - both build on this module
+    from symphony.planners.included import IDMPlanner  # noqa: PLC0415 - these build on this module
+    from symphony.planners.process import ProcessPlanner  # noqa: PLC0415
     from symphony.planners.view import FunctionPlanner  # noqa: PLC0415
 
     name, given = planner_name(planner), planner
@@ -203,7 +205,7 @@ def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
     except (Exception, SystemExit) as error:  # whatever a user's planner raises
         raise ConfigError(f"planner '{name}' can't be made: {type(error).__name__}: {error}") from error
     missing = [part for part in ("reset", "plan") if not callable(getattr(made, part, None))]
-    if missing and not hasattr(made, "rule"):
+    if missing and not (isinstance(made, IDMPlanner) and len(missing) == 2):
         raise ConfigError(f"planner '{name}' has no {' and no '.join(missing)}")
     return given
 

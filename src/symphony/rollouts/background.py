@@ -53,14 +53,15 @@ class CarFollower(TensorDictModuleBase):
 
     Args:
         env: whose scenes have routes.
+        driver: the parameters, if they are not the usual ones.
     """
 
     in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID]  # noqa: RUF012 - the type the base declares
     out_keys = [keys.BACKGROUND]  # noqa: RUF012
 
-    def __init__(self, env: DrivingEnv) -> None:
+    def __init__(self, env: DrivingEnv, driver: included.IDMPlanner | None = None) -> None:
         super().__init__()
-        self.env, self.driver = env, included.IDMPlanner()
+        self.env, self.driver = env, driver or included.IDMPlanner()
         self.routes = _routes(env.scenes, self.driver)
 
     @torch.no_grad()

@@ -127,7 +127,7 @@ def simulation(
     if egos is not None and kind == "backtrack":
         raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
     if egos is not None:
-        planned = ego_policy(env, egos, start, config.seed, RULES, forked=searches)
+        planned = ego_policy(env, egos, start, config.seed, CarFollower, forked=searches)
         actor = TensorDictSequential(actor, planned)
     lure = None if toward is None else toward(env, start)
     actor = actor if lure is None else TensorDictSequential(actor, lure)
