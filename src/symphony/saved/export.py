@@ -162,9 +162,8 @@ class _Network:
         for tag, other in beside + [("successor", b) for a, b in self.flow if a == k]:
             _add(node, tag, ref=self.ids[other])
         for tag, name in (("adjacentLeft", "left_neighbors"), ("adjacentRight", "right_neighbors")):
-            for other in [b for a, b in self._pairs(name) if a == k][
-                :1
-            ]:  # the format knows one on either side
+            # The format knows one on either side.
+            for other in [b for a, b in self._pairs(name) if a == k][:1]:
                 _add(node, tag, ref=self.ids[other], drivingDir="same")
         _add(node, "laneletType", _LANES.get(kind, "unknown"))
         for tag, number in refs:

@@ -95,7 +95,8 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
         with naming(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
         there = set(os.listdir(self.path))
-        if there - {LOCK, SEGMENTS, INDEX} and MANIFEST not in there:  # one that has just begun has none yet
+        # Of a writer that was killed before there was a manifest its lock is left.
+        if MANIFEST not in there and there and (LOCK not in there or there - {LOCK, SEGMENTS, INDEX}):
             raise DataError("not empty and no folder of rollouts: refusing to write into it", file=self.path)
         self._lock = Lock(self.path / LOCK)
         self.close = self._lock.close
