@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 
 from helpers_segments import straight_road
 from symphony import keys
-from symphony.bench.rare import leaf_weights, resampling
+from symphony.bench.rare import Rate, leaf_weights, remarks, resampling
 from symphony.cli import main
 from symphony.collectors import Systematic, beam_search, branch
 from symphony.data.builtin import builtin_store
@@ -124,29 +124,65 @@ def test_the_command_finds_the_rate_of_free_rollouts_and_keeps_what_shows_it(tmp
     rate = report(load_rollouts(tmp_path / "free"), "ego").totals()["collision_rate"] / 100
     assert 0 < rate < 1
     assert abs(mean["rate"] - rate) < 3 * math.hypot(mean["error"], math.sqrt(rate * (1 - rate) / 64))
+    capsys.readouterr()
     (saved,) = load_rollouts(out)
-    assert saved.rollouts == segment["shown"] > 0
+    assert saved.rollouts == segment["kept"] > 0
     assert saved.collision[:, :, 0].any(1).all()
-    assert main(["hunt", *words, *kept]) == 1  # the folder is not new
-    assert main(["hunt", "idm", *words[1:], "--out", str(tmp_path / "idm")]) == 1  # nothing is random there
+    assert main(["hunt", *words, *kept, "--metric", "offroad_rate"]) == 1
+    assert "another simulation, which differs in settings.hunt" in capsys.readouterr().err
+    # What was picked is no sample of anything.
+    for command in (["report", str(out)], ["planners", str(tmp_path / "free"), str(out)]):
+        assert main(command) == 1
+        assert "count nothing" in capsys.readouterr().err
+    assert main(["view", str(out)]) == 0
+
+
+@pytest.mark.parametrize("words", ["idm", "constant_velocity", "pretrained:bc_ts_h --interactive 1"])
+def test_where_nothing_is_random_there_is_nothing_to_hunt(words, tmp_path, capsys):
+    command = f"hunt {words} --planner log --data {builtin_store('test')} --segments 0 --out {tmp_path}"
+    assert main(command.split()) == 1
+    assert "one run of each segment says it all" in capsys.readouterr().err
+
+
+def test_what_a_rate_is_worth_is_said():
+    def said(rate, trees):
+        return " ".join(remarks([Rate("a", rate, 0.1, trees, 1), Rate(None, rate, 0.1, trees, 1)]))
+
+    assert said(0.1, 4) == ""
+    assert "rough" in said(0.1, 3)
+    assert "take more branches" in said(1.1, 8)
+    assert "bounds no rate" in said(0.0, 0)
+    assert said(math.nan, 0) == ""
 
 
 def test_a_hunt_says_no_zero_for_what_it_does_not_know(tmp_path, capsys):
-    (tmp_path / "fails.py").write_text("def plan(s): raise ValueError('flat tyre')\n")
-    words = f"hunt pretrained:bc_ts_h --data {builtin_store('test')} --trees 2 --branches 2".split()
+    plan = "def plan(s):\n    if '001000-f0-w09' in s.segment_id: raise ValueError('flat tyre')\n    return 0, 0\n"
+    (tmp_path / "fails.py").write_text(plan)
+    words = f"hunt pretrained:bc_ts_h --data {builtin_store('test')} --trees 4 --branches 2 --out x".split()
 
-    def told(planner, segment, *more):
-        out = str(tmp_path / f"out-{len(list(tmp_path.iterdir()))}")
-        code = main([*words, "--planner", planner, "--segments", segment, "--out", out, *more])
+    def told(planner, segment, out, *more):
+        words[-1] = str(tmp_path / out)
+        code = main([*words, "--planner", planner, "--segments", *segment.split(), *more])
         return code, *capsys.readouterr()
 
     fails = f"{tmp_path / 'fails.py'}:plan"
-    code, _, error = told(fails, "0")
-    assert code == 1
-    assert re.search(r"segment sumo-town-001000-f0-w09-v29: .* in 4 of 4 runs, the first: .*flat tyre", error)
-    found = json.loads(told(fails, "0", "--metric", "failed_rate", "--json", "-")[1])
+    code, _, error = told(fails, "0", "all")
+    assert code == 3
+    assert re.search(r"failed in 8 of 8 runs, the first: .*flat tyre.*metric failed_rate", error)
+    found = json.loads(told(fails, "0", "failed", "--metric", "failed_rate", "--json", "-")[1])
     assert [one["rate"] for one in found] == [pytest.approx(1.0, abs=0.5)] * 2
+    # Where it fails in one segment, the others have their rates; the same hunt finds the same once more.
+    for _ in range(2):
+        code, text, error = told(fails, "0 19", "one", "--metric", "collision_rate", "--json", "-")
+        lost, other, mean = json.loads(text)
+        assert (code, lost["rate"], mean["rate"]) == (0, None, other["rate"])
+        assert lost["failed"] in error
+        folder = load_rollouts(tmp_path / "one")
+        assert [entry.failed for entry in folder.failures] == [lost["failed"]]
+        assert [saved.rollouts for saved in folder] == [other["kept"]] * bool(other["kept"])
     # Nobody is hit: the rate is 0 as far as was seen, and has no error; no light is there to be run.
-    zero = json.loads(told("log", "0", "--json", "-")[1])[-1]
+    zero = json.loads(told("log", "0", "zero", "--json", "-")[1])[-1]
     assert (zero["rate"], zero["error"]) == (0.0, None)
-    assert re.search(r"– +– +0\nno run shows it", told("log", "3", "--metric", "red_light_rate")[1])
+    assert re.search(
+        r"mean of 0 +– +– +0 of 0 +0\n", told("log", "3", "dark", "--metric", "red_light_rate")[1]
+    )

@@ -62,20 +62,17 @@ class Criticality:
         return sum(max(0.0, min(1.0, part)) for part in parts)
 
 
-def criticality(segment: RunSegment, world: World | None = None) -> Criticality:
-    """How critical a run segment is for its ego, by the log or in a simulated world; others on another level do not
-    count.
-    """
-    if world is None:
-        heights = agent_heights(segment)
-        world = World(
-            segment.position[..., :2].astype(np.float64),
-            segment.heading.astype(np.float64),
-            segment.velocity.astype(np.float64),
-            segment.valid,
-            segment.size[:, :2].astype(np.float64),
-            heights.swapaxes(0, 1) if len(heights) else None,
-        )
+def criticality(segment: RunSegment) -> Criticality:
+    """How critical the log of a run segment is for its ego; others on another level do not count."""
+    heights = agent_heights(segment)
+    world = World(
+        segment.position[..., :2].astype(np.float64),
+        segment.heading.astype(np.float64),
+        segment.velocity.astype(np.float64),
+        segment.valid,
+        segment.size[:, :2].astype(np.float64),
+        heights.swapaxes(0, 1) if len(heights) else None,
+    )
     seen = np.flatnonzero(world.valid[segment.ego])
     slower = np.diff(world.speed[segment.ego, seen]) / (np.diff(seen) * segment.dt)
     ego = _boxes(world, np.full(len(seen), segment.ego), seen)
@@ -106,10 +103,8 @@ def _encroachment(
     turn = world.heading[segment.ego, mine] - world.heading[who, step]
     crosses = np.abs((turn + np.pi) % (2 * np.pi) - np.pi) > CROSSING
     if world.height is not None:
-        one, two = (
-            torch.from_numpy(world.height[segment.ego, mine]),
-            torch.from_numpy(world.height[who, step]),
-        )
+        places = ((segment.ego, mine), (who, step))
+        one, two = (torch.from_numpy(world.height[place]) for place in places)
         crosses &= ~levels_apart(one, two).numpy()
     least = float(apart[crosses & (apart > 0)].min(initial=math.inf))
     return least if least <= LONGEST else math.inf

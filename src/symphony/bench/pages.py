@@ -40,9 +40,8 @@ def junit(result: Result) -> str:
         about = {"name": _safe(pair.name), **counts, "time": f"{pair.seconds:.1f}"}
         suite = ET.SubElement(root, "testsuite", about)
         for one in mine:
-            case = ET.SubElement(
-                suite, "testcase", classname=_safe(pair.name), name=_safe(str(one.threshold))
-            )
+            about = {"classname": _safe(pair.name), "name": _safe(str(one.threshold))}
+            case = ET.SubElement(suite, "testcase", about)
             if one.status != "passes":
                 failure = ET.SubElement(case, "failure", type=one.status, message=_safe(sentence(one)))
                 failure.text = _safe("\n".join(_lines(pair)))
@@ -129,9 +128,8 @@ def _table(
     if marks is not None:
         heads, lines = ("", *heads), [[mark, *line] for mark, line in zip(marks, lines, strict=True)]
     found = [f"<h2>{escape(title)}</h2><table><tr>", *(f"<th>{escape(text)}" for text in heads)]
-    return (
-        "".join(found + ["".join(["<tr>", *(f"<td>{cell}" for cell in line)]) for line in lines]) + "</table>"
-    )
+    found += ["".join(["<tr>", *(f"<td>{cell}" for cell in line)]) for line in lines]
+    return "".join(found) + "</table>"
 
 
 def _safe(text: str) -> str:

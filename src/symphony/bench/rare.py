@@ -1,9 +1,9 @@
 """How often a planner fails among learned agents, where that is rare: what leads to it is simulated more often.
 
-A particle filter (:class:`symphony.collectors.Resampling`) simulates the branches of a tree. Every second those in
-which the ego comes near to a collision are copied and others dropped, with weights that make up for it: the mean over
-branches of weight times failure has no bias, whatever is taken for near. Branches only ever go on, so that planners
-are forked like branches and never go back; splitting at levels needs each planner as it was when it passed a level.
+A particle filter (:class:`symphony.collectors.Systematic`) simulates the branches of a tree. Every :data:`PERIOD`
+those in which the ego comes near to a collision are copied and others dropped, with weights that make up for it: the
+mean over branches of weight times failure has no bias, whatever is taken for near. Branches only ever go on, so that
+planners are forked like branches and never go back; splitting at levels needs each planner as it passed a level.
 
 Source: Del Moral and Garnier, "Genealogical particle analysis of rare events", Ann. Appl. Probab. 15 (2005).
 """
@@ -27,7 +27,8 @@ from symphony.agents import Agent
 from symphony.bench.measures import MEASURES
 from symphony.collectors import BeamSearchResult, Systematic
 from symphony.config import EvaluateConfig
-from symphony.errors import ConfigError, DataError
+from symphony.envs.dynamics import ConstantVelocity
+from symphony.errors import AllFailedError, ConfigError
 from symphony.evaluation.report import Report, add_segment
 from symphony.learning.demonstrations import SceneDataset
 from symphony.planners.driver import EgoPlanners
@@ -46,6 +47,8 @@ TOGETHER = 4
 """Run segments simulated at a time, unless more are asked for."""
 KEPT = 3
 """Failing runs of a segment that are kept, at most."""
+FEW = 4
+"""Trees that show it, fewer than which are too few to tell its rate by."""
 
 
 def resampling() -> Systematic:
@@ -64,16 +67,20 @@ def leaf_weights(found: BeamSearchResult) -> Float[Tensor, "*b L"]:
 
 @dataclass(frozen=True)
 class Rate:
-    """How often something happens: a share, its standard error over trees, and the simulated runs that showed it.
+    """How often something happens in a run segment: a share, its standard error over trees, in how many trees it was
+    seen, how many of the runs that show it are kept, and why there is no share where the planner failed.
 
-    ``segment`` is None for the mean over segments, whose error is that for these segments, not for others. NaN: the
-    metric is not defined there, or, of an error, nothing was seen that would have one.
+    ``segment`` is None for the mean over segments that have a share; its error is that for these, not for others.
+    NaN: the metric is not defined there, or, of an error, nothing was seen that would have one. A share above 1 is no
+    mistake: few branches scatter to both sides of what is true.
     """
 
     segment: str | None
     rate: float
     error: float
-    shown: int
+    trees: int
+    kept: int
+    failed: str = ""
 
 
 @dataclass(frozen=True)
@@ -89,8 +96,8 @@ class Hunt:
     planner: str | Callable[..., Any]
     metric: str
 
-    def __call__(self, items: list[int]) -> list[tuple[SavedRollouts, NDArray[np.float64]]]:
-        """Of each segment the runs that show what the metric counts, few of them, and the estimates of all trees."""
+    def __call__(self, items: list[int]) -> list[tuple[SavedRollouts, Rate]]:
+        """Of each segment a few of the runs that show what the metric counts, and how often it happens."""
         agent, config, name = self.agent, self.config, planner_name(self.planner)
         with naming(self.dataset, items):
             scenes = self.dataset.scenes(items).to(torch.device(config.device))
@@ -106,14 +113,15 @@ class Hunt:
                 saved = saved_rollouts(segment, on_cpu, rollouts, b, failed=found.failed[b], **about)
                 report = Report(agent.name, "ego")
                 add_segment(report, saved)
-                if saved.failed and self.metric != "failed_rate":
-                    lost = f"{name} failed in {len(saved.failed)} of {saved.rollouts} runs, the first: "
-                    why = f"{min(saved.failed.items())[1]}; metric failed_rate counts such runs"
-                    raise DataError(lost + why, segment=segment.segment_id)
                 values = [MEASURES[self.metric].of(run) for run in report.rows]
                 hits = np.array([bool(value) for value in values]).reshape(weight[b].shape)
+                lost = sorted(saved.failed.items()) if self.metric != "failed_rate" else []
+                why = (
+                    f"failed in {len(lost)} of {saved.rollouts} runs, the first: {lost[0][1]}" if lost else ""
+                )
+                kept = _kept(saved, hits & (not why))
                 known = np.nan if None in values else 1.0
-                out.append((_kept(saved, hits), (hits * weight[b]).mean(-1) * known))
+                out.append((kept, _rate(kept, (hits * weight[b]).mean(-1) * known, why)))
             return out
 
 
@@ -126,54 +134,75 @@ def _kept(saved: SavedRollouts, hits: NDArray[np.bool_]) -> SavedRollouts:
     return replace(saved, **parts, failed=failed)
 
 
-def _rate(segment: str, estimates: NDArray[np.float64], shown: int) -> Rate:
+def _rate(kept: SavedRollouts, estimates: NDArray[np.float64], why: str) -> Rate:
     """The mean of the estimates of independent trees."""
-    seen = len(estimates) > 1 and bool(estimates.any())
-    error = float(estimates.std(ddof=1)) / math.sqrt(len(estimates)) if seen else math.nan
-    return Rate(segment, float(estimates.mean()), error, shown)
+    trees = int((estimates > 0).sum())
+    error = float(estimates.std(ddof=1)) / math.sqrt(len(estimates)) if trees else math.nan
+    return Rate(kept.segment.segment_id, float(estimates.mean()), error, trees, kept.rollouts, why)
 
 
 def hunt(path: Path, hunter: Hunt, progress: Callable[[int, int], None] | None = None) -> list[Rate]:
-    """The rates in all segments and, last, their mean; some runs of each that show it are kept in a new folder.
+    """The rates in all segments and, last, their mean; a few runs of each that show it are kept in a folder, in which
+    the same hunt finds them again.
 
-    Segments whose ego can't be driven are put on record as failed there, and count for nothing.
+    Segments in which the planner failed, or whose ego can't be driven, are put on record as failed there.
 
     Raises:
-        ConfigError: nothing is drawn at random around the planner, it can't be copied, or the folder is not new.
-        DataError: the planner failed in a run, which no other metric than ``failed_rate`` counts.
+        AllFailedError: the planner failed in every segment.
+        ConfigError: nothing is drawn at random around the planner, it can't be copied, or there is no such rate.
         SymphonyError: as of :func:`symphony.saved.saving.save_simulation`.
     """
     agent, data, config = hunter.agent, hunter.dataset, hunter.config
     planner_maker(hunter.planner)  # or complain before anything is simulated
-    if agent.policy is None or agent.rule:
-        raise ConfigError(f"{agent.name} draws nothing at random: one run of each segment says it all")
-    if path.exists() and any(path.iterdir()):
-        raise ConfigError(f"{path} is not empty")
+    rates = [name for name, measure in MEASURES.items() if measure.kind == "rate"]
+    if hunter.metric not in rates:
+        raise ConfigError(f"metric is one of {', '.join(rates)}, not '{hunter.metric}'")
+    alone = (config.interactive or agent.interactive) == 1
+    if alone or agent.policy is None or agent.rule or isinstance(agent.policy, ConstantVelocity):
+        what = "only the ego is driven" if alone else f"{agent.name} draws nothing at random"
+        raise ConfigError(f"{what}: one run of each segment says it all")
     search: dict[str, Any] = {"search": "tree", "score": "flags", "rule": f"{__name__}:resampling"}
     search |= {"goals": "branch", "prune_every": max(1, round(PERIOD / data.segment(0).dt))}
     config = replace(config, **search, rollouts=config.trees * config.branches)
     hunter = replace(hunter, config=config)
     settings = plain_settings(config, agent, data.interactive, data.duration)
-    settings["planner"] = source_of(hunter.planner)
+    settings |= {"planner": source_of(hunter.planner), "hunt": hunter.metric}
     name = planner_name(hunter.planner)
     about = About.of(agent.name, data.store, settings, seed=config.seed, planner=name)
     found: list[Rate] = []
     with RolloutWriter(path, about) as writer:
         items = [i for i in range(len(data)) if has_ego(writer, data, i, config.rollouts)]
-        with closing(
-            shared(hunter, batches(items, config.batch or TOGETHER, config), config, data)
-        ) as results:
-            for result in results:
-                for saved, estimates in result:
-                    found.append(_rate(saved.segment.segment_id, estimates, saved.rollouts))
-                    if saved.rollouts:
-                        writer.add(saved)
+        tasks = batches(items, config.batch or TOGETHER, config)
+        with closing(shared(hunter, tasks, config, data)) as results:
+            for saved, rate in (one for result in results for one in result):
+                found.append(rate)
+                segment = saved.segment
+                if rate.failed:
+                    writer.fail(segment.segment_id, config.rollouts, rate.failed, segment.group)
+                elif saved.rollouts and not writer.has(segment.segment_id):
+                    writer.add(saved)
                 if progress is not None:
                     progress(len(found), len(items))
     if not found:
         raise ConfigError("the ego of no run segment can be driven")
+    if all(one.failed for one in found):
+        raise AllFailedError(f"{name} {found[0].failed}; so everywhere: metric failed_rate counts such runs")
     known = [one for one in found if not math.isnan(one.rate)]
     seen = [one for one in known if one.rate > 0]
     mean = sum(one.rate for one in seen) / len(known) if known else math.nan
     error = math.hypot(*(one.error for one in seen)) / len(known) if seen else math.nan
-    return [*found, Rate(None, mean, error, sum(one.shown for one in found))]
+    return [*found, Rate(None, mean, error, sum(one.trees for one in seen), sum(one.kept for one in found))]
+
+
+def remarks(found: list[Rate]) -> list[str]:
+    """What must be said of rates, the mean last, so that nobody takes them for more than they are."""
+    out = [f"{one.segment}: the planner {one.failed}" for one in found if one.failed]
+    if any(one.rate > 1 for one in found):
+        out.append("a rate came to more than 100 %: take more branches")
+    if rough := sum(0 < one.trees < FEW for one in found):
+        out.append(
+            f"{rough} of the rates and errors are rough: fewer than {FEW} trees show it, take more trees"
+        )
+    if found[-1].rate == 0:
+        out.append("no run shows it: it may be too rare for so few trees and branches, which bounds no rate")
+    return out

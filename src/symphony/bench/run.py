@@ -108,16 +108,14 @@ class Result:
 
         def verdict(one: Verdict) -> dict[str, Any]:
             limit, found = one.threshold, one.found
-            return {
-                **{
-                    "planner": one.planner,
-                    "crowd": one.crowd,
-                    "threshold": str(limit),
-                    "metric": limit.metric,
-                },
-                **{"compared": limit.compared, "status": one.status, "value": found.mean, "bound": one.bound},
-                **{"limit": limit.limit, "runs": found.runs, "groups": found.groups},
+            who = {
+                "planner": one.planner,
+                "crowd": one.crowd,
+                "threshold": str(limit),
+                "metric": limit.metric,
             }
+            what = {"compared": limit.compared, "status": one.status, "value": found.mean, "bound": one.bound}
+            return {**who, **what, "limit": limit.limit, "runs": found.runs, "groups": found.groups}
 
         def pair(one: Pair) -> dict[str, Any]:
             return {
@@ -140,13 +138,8 @@ class Result:
 
 
 def run_suite(suite: Suite, out: Path, progress: Progress = None, *, view: bool = True) -> Result:
-    """Simulate and judge a suite; what was interrupted goes on where it stopped.
-
-    Args:
-        suite: all of it.
-        out: folder of the results: ``result.json``, and the rollouts below ``PLANNER/CROWD``.
-        progress: called with a pair's name, the runs done and their total.
-        view: whether each pair gets a page that plays its rollouts.
+    """Simulate and judge a suite; what was interrupted goes on where it stopped. In the folder ``out`` come to lie
+    ``result.json`` and, below ``PLANNER/CROWD``, the rollouts, with a page that plays them if there shall be a view.
 
     Raises:
         AllFailedError: every run failed.

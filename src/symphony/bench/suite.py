@@ -114,11 +114,7 @@ class Suite:
 
 
 def read_suite(path: Path, **shared: Any) -> Suite:
-    """Read a suite and check all of it.
-
-    Args:
-        path: the file.
-        shared: settings of :class:`symphony.config.EvaluateConfig` that are the machine's, such as ``workers``.
+    """Read a suite and check all of it; ``shared`` are settings of the machine, such as ``workers``.
 
     Raises:
         ConfigError: something can't be used; names file, line and field.
@@ -164,11 +160,9 @@ def read_suite(path: Path, **shared: Any) -> Suite:
         if not baseline.is_file():
             raise top.wrong("baseline", "is no planner of the suite and no file")
     groups = len({str(store.groups[i]) for i in items})
-    thresholds = [
-        _threshold(one, names, sure, groups, compares=bool(baseline)) for one in tables["threshold"]
-    ]
+    limits = tuple(_threshold(one, names, sure, groups, bool(baseline)) for one in tables["threshold"])
     name = top.given.get("name", path.stem)
-    return Suite(name, path, store, items, planners, crowds, tuple(thresholds), baseline)
+    return Suite(name, path, store, items, planners, crowds, limits, baseline)
 
 
 @dataclass(frozen=True)
@@ -278,7 +272,7 @@ def _crowd(table: _Table, shared: dict[str, Any]) -> Crowd:
 
 
 def _threshold(
-    table: _Table, names: dict[str, list[str]], sure: float, groups: int, *, compares: bool
+    table: _Table, names: dict[str, list[str]], sure: float, groups: int, compares: bool
 ) -> Threshold:
     """A threshold that some planner could keep with segments of so many groups."""
     given, confidence = table.given, table.given.get("confidence", sure)
@@ -306,19 +300,11 @@ def _threshold(
                 raise table.wrong(side, f"no number of runs shows {shown}; set confidence = false")
             needed = needed_groups(room, confidence)
         if groups < needed:
-            raise table.wrong(
-                side,
-                f"needs at least {needed} independent groups of segments; these segments are of {groups}",
-            )
-    return Threshold(
-        given["metric"],
-        float(given[side]),
-        side,
-        None if confidence is False else confidence,
-        tuple(given.get("planners", names["planners"])),
-        tuple(given.get("crowds", names["crowds"])),
-        compared,
-    )
+            what = f"needs at least {needed} independent groups of segments"
+            raise table.wrong(side, f"{what}; these segments are of {groups}")
+    planners, crowds = (tuple(given.get(key, known)) for key, known in names.items())
+    limit = float(given[side])
+    return Threshold(given["metric"], limit, side, confidence or None, planners, crowds, compared)
 
 
 def _items(store: SegmentStore, given: int | list[Any]) -> tuple[int, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from math import isnan
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,6 @@ from symphony import errors, files
 from symphony.cli import shared
 from symphony.config import checks
 
-Several = Annotated[int, checks.Bounds(2)]
 Device = Annotated[str, arg(help="Device that simulates: `cpu`, `cuda` or `cuda:N`.")]
 
 
@@ -97,11 +97,12 @@ class Hunt(shared.Command):
     agent: Annotated[Positional[str], arg(metavar="RUN")]
     planner: str  # Planner that drives the ego, one that can be copied, as for `symphony simulate`.
     data: Path  # Store of run segments.
-    out: Path  # New folder of the runs that are kept.
+    out: Path  # Folder of the runs that are kept, at most 3 of a run segment.
     metric: str = "at_fault_collision_rate"  # Rate to estimate, one that a suite of `symphony test` can hold.
     segments: shared.Segments = ()
-    trees: Several = 8  # Independent trees of each run segment.
-    branches: Several = 32  # Branches of each tree.
+    trust_code: shared.TrustCode = False
+    trees: Annotated[int, checks.Bounds(4)] = 8  # Independent trees of each run segment.
+    branches: Annotated[int, checks.Bounds(2)] = 32  # Branches of each tree.
     interactive: checks.Natural = 0  # Agents that are driven, the ego included; 0: as the agent was trained.
     duration: checks.Natural = 0  # Seconds that are simulated; 0: as many as the agent was trained with.
     seed: int = 0  # Seed of everything that is drawn at random.
@@ -112,23 +113,26 @@ class Hunt(shared.Command):
 
     def __call__(self) -> None:
         from symphony.bench import rare
-        from symphony.bench.measures import MEASURES
         from symphony.rollouts.crowd import crowd_dataset
 
-        rates = [name for name, measure in MEASURES.items() if measure.kind == "rate"]
-        if self.metric not in rates:
-            raise errors.ConfigError(f"metric is one of {', '.join(rates)}, not '{self.metric}'")
         names = ("trees", "branches", "interactive", "duration", "seed", "workers", "engine", "device")
         config = symphony.EvaluateConfig(**{name: getattr(self, name) for name in names}, rollouts=self.trees)
-        agent, store = symphony.load_agent(self.agent, self.device), symphony.SegmentStore(self.data)
+        agent = symphony.load_agent(self.agent, self.device, trust_code=self.trust_code)
+        store = symphony.SegmentStore(self.data)
         chosen = shared.segment_indices(store, self.segments) or None
         dataset = crowd_dataset(store, agent, config, chosen, routes=True)
         with shared.progress("hunting") as advance:
             found = rare.hunt(self.out, rare.Hunt(agent, dataset, config, self.planner, self.metric), advance)
+        known = sum(not isnan(one.rate) for one in found[:-1])
         if shared.write_numbers(self.json, [asdict(one) for one in found]):
-            rows = [["segment", f"{MEASURES[self.metric].text} %", "±", "runs kept"]]
+            rows = [["segment", f"{self.metric} %", "±", "in trees", "runs kept"]]
             for one in found:
-                told = [shared.number_cell(100 * x, None, 3) for x in (one.rate, one.error)]
-                rows.append([one.segment or f"all {len(found) - 1}", *told, str(one.shown)])
+                numbers = (100 * min(one.rate, 1.0), 100 * one.error)
+                told = ["–" if isnan(x) else f"{x:.3g}" for x in numbers]
+                trees = f"{one.trees} of {self.trees * (1 if one.segment else known)}"
+                rows.append([one.segment or f"mean of {known}", *told, trees, str(one.kept)])
             shared.print_table(rows, heads=1)
-            shared.say(f"see them: symphony view {self.out}" if found[-1].shown else "no run shows it")
+            if found[-1].kept:
+                shared.say(f"see them: symphony view {self.out}")
+        for remark in rare.remarks(found):
+            shared.tell(remark)

@@ -79,7 +79,7 @@ class Segment(shared.Command):
         segment = store[shared.segment_indices(store, [self.segment])[0]]
         if not 0 <= self.step < segment.num_steps:
             raise errors.ConfigError(
-                f"--step {self.step} is outside the {segment.num_steps} steps of the segment"
+                f"--step {self.step} is outside the {segment.num_steps} steps of the log"
             )
         choice = interactive_choice(segment, self.interactive)
         title = segment.segment_id + (f" ({choice.context})" if choice.context else "")

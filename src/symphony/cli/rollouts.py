@@ -31,7 +31,7 @@ class Simulate(shared.Simulation):
     planner_seconds: float = 60.0  # Seconds that a planner has for one answer; a longer one fails the run.
     #: Number of runs to simulate (a run is one rollout of one segment) in place of `rollouts`: evenly spread over the
     #: segments, a few more where the number can't be divided so. 0: all segments, `rollouts` of each.
-    runs: int = 0
+    runs: checks.Natural = 0
     #: Goals of agents, by their ids in the source: `7=lane:103` for a route over the lane of that id, `7=12.5,-40`
     #: for one that comes past a point (metres, in the frame of the segment); all others as the agent draws them.
     goal: Annotated[tuple[str, ...], arg(metavar="ID=PLACE ...")] = ()
@@ -39,12 +39,8 @@ class Simulate(shared.Simulation):
 
     def __post_init__(self) -> None:
         evaluation.check_planner_seconds(self.planner_seconds)
-        if self.runs < 0 or (self.runs and self.segments):
-            raise errors.ConfigError("--runs is a number of runs, and goes without --segments")
-        if self.runs and self.config.rollouts != EvaluateConfig.rollouts:
-            raise errors.ConfigError(
-                "--runs says how many rollouts a segment gives, and goes without --rollouts"
-            )
+        if self.runs and (self.segments or self.config.rollouts != EvaluateConfig.rollouts):
+            raise errors.ConfigError("--runs says which segments and rollouts: no --segments, no --rollouts")
 
     def __call__(self) -> None:
         from symphony.learning.demonstrations import evenly_spaced
@@ -103,7 +99,7 @@ class View(shared.Command):
         out = self.folder / "view.html" if self.out is None else self.out
         with files.lock_file(out) if self.out is None else nullcontext():
             if out.suffix.lower() == ".html":
-                write_view(folder, report(folder), out)
+                write_view(folder, report(folder, picked=True), out)
             elif not (names := self.segments or folder.ids[:6]):
                 raise errors.ConfigError(f"{self.folder} holds no rollouts to draw")
             else:

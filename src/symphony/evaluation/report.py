@@ -95,25 +95,24 @@ def report(
     folder: RolloutFolder,
     evaluated: Evaluated = "interactive",
     progress_bar: Callable[[int, int], None] | None = None,
+    *,
+    picked: bool = False,
 ) -> Report:
-    """Evaluate all rollouts of a folder.
-
-    Args:
-        folder: the rollouts.
-        evaluated: which of the driven agents; a DataError says that the ego is none of them.
-        progress_bar: called with the segments done and their total.
+    """Evaluate all rollouts of a folder, of all interactive agents or of the ego: a DataError if it was not driven,
+    or, unless that is allowed, if runs were picked for what they show, so that totals mean nothing. ``progress_bar``
+    is called with the segments done and their total.
     """
+    if not picked and "hunt" in folder.about.settings:
+        raise DataError(
+            "`symphony hunt` picked runs that fail: see them, but count nothing", file=folder.path
+        )
     found = Report(folder.about.agent, evaluated)
     for number, saved in enumerate(folder):
         add_segment(found, saved)
         if progress_bar is not None:
             progress_bar(number + 1, len(folder))
     for lost in folder.failures:
-        about = {
-            "segment": lost.segment,
-            "group": lost.group or lost.segment,
-            "failed": lost.failed or "failed",
-        }
+        about = {"segment": lost.segment, "group": lost.group or lost.segment, "failed": lost.failed}
         found.rows += [dict.fromkeys(NUMBERS) | about | {"rollout": k} for k in range(lost.rollouts)]
     return found
 
