@@ -135,22 +135,19 @@ def test_commonroad_document_types_are_refused(attack: str, encoding: str, tmp_p
     assert (error.field, error.file) == ("DOCTYPE", path)
 
 
-@pytest.mark.parametrize(
-    ("text", "field", "message"),
-    [
-        (commonroad(driver(7)), "lanelet", "has no lanes"),
-        (commonroad(ROAD), "dynamicObstacle", "has no dynamic obstacles"),
-        (commonroad(ROAD, driver(7, speed=0)), "dynamicObstacle", "no moving vehicle"),
-        (GOOD.replace("2020a", "2017a"), "commonRoadVersion", "2018b or 2020a"),
-        (GOOD.replace('timeStepSize="0.1"', ""), "timeStepSize", "not a number"),
-        (GOOD.replace('timeStepSize="0.1"', 'timeStepSize="nan"'), "timeStepSize", "not finite"),
-        (GOOD.replace("<exact>3</exact>", "<exact>90000</exact>", 1), "time", "at most"),
-        (GOOD.replace("<length>4.5", "<length>0", 1), "size", "must be positive"),
-        (GOOD.replace('lanelet id="11"', 'lanelet id="10"'), "road.lane_id", "not unique"),
-        (GOOD.replace('Obstacle id="8"', 'Obstacle id="7"'), "agent_id", "not unique"),
-        (commonroad(ROAD, driver(7, x=1e6), driver(8)), "position", "not re-centred"),
-    ],
-)
+@pytest.mark.parametrize(("text", "field", "message"), [
+    (commonroad(driver(7)), "lanelet", "has no lanes"),
+    (commonroad(ROAD), "dynamicObstacle", "has no dynamic obstacles"),
+    (commonroad(ROAD, driver(7, speed=0)), "dynamicObstacle", "no moving vehicle"),
+    (GOOD.replace("2020a", "2017a"), "commonRoadVersion", "2018b or 2020a"),
+    (GOOD.replace('timeStepSize="0.1"', ""), "timeStepSize", "not a number"),
+    (GOOD.replace('timeStepSize="0.1"', 'timeStepSize="nan"'), "timeStepSize", "not finite"),
+    (GOOD.replace("<exact>3</exact>", "<exact>90000</exact>", 1), "time", "at most"),
+    (GOOD.replace("<length>4.5", "<length>0", 1), "size", "must be positive"),
+    (GOOD.replace('lanelet id="11"', 'lanelet id="10"'), "road.lane_id", "not unique"),
+    (GOOD.replace('Obstacle id="8"', 'Obstacle id="7"'), "agent_id", "not unique"),
+    (commonroad(ROAD, driver(7, x=1e6), driver(8)), "position", "not re-centred"),
+])  # fmt: skip
 def test_commonroad_errors_are_named(text: str, field: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "a.xml"
     path.write_text(text)
@@ -161,21 +158,18 @@ def test_commonroad_errors_are_named(text: str, field: str, message: str, tmp_pa
     assert error.segment == (None if field == "commonRoadVersion" else "ZAM_Made-1_1_T-1")
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "kind", "example"),
-    [
-        ("<exact>3</exact>", "<exact>2</exact>", NO_OBSTACLE, "obstacle 7: time: two states at step"),
-        ("<exact>1</exact>", "<intervalStart>1</intervalStart>", NO_OBSTACLE, "obstacle 7"),  # predicted
-        ("<x>1.0</x>", "<x>NaN</x>", NO_OBSTACLE, "obstacle 7: position: nan is not finite"),
-        ("<velocity><exact>10.0", "<velocity><exact>fast", NO_OBSTACLE, "obstacle 7: velocity: 'fast'"),
-        (RECTANGLE, "", NO_OBSTACLE, "obstacle 7: shape: expected one rectangle"),
-        ('Obstacle id="7"', 'Obstacle id="99999999999999999999"', NO_OBSTACLE, "64 bits"),
-        ("<x>25</x>", "<x>inf</x>", NO_LANELET, "lanelet 10: bound: inf is not finite"),
-        ('ref="11"', 'ref="next"', NO_LANELET, "lanelet 10: successor: 'next' is not an integer"),
-        ("<color>red", "<color>pink", NO_LIGHT, "trafficLight 30: color: unknown colors ['pink']"),
-        ("<duration>3</duration>", "", NO_LIGHT, "trafficLight 30: duration"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "kind", "example"), [
+    ("<exact>3</exact>", "<exact>2</exact>", NO_OBSTACLE, "obstacle 7: time: two states at step"),
+    ("<exact>1</exact>", "<intervalStart>1</intervalStart>", NO_OBSTACLE, "obstacle 7"),  # predicted
+    ("<x>1.0</x>", "<x>NaN</x>", NO_OBSTACLE, "obstacle 7: position: nan is not finite"),
+    ("<velocity><exact>10.0", "<velocity><exact>fast", NO_OBSTACLE, "obstacle 7: velocity: 'fast'"),
+    (RECTANGLE, "", NO_OBSTACLE, "obstacle 7: shape: expected one rectangle"),
+    ('Obstacle id="7"', 'Obstacle id="99999999999999999999"', NO_OBSTACLE, "64 bits"),
+    ("<x>25</x>", "<x>inf</x>", NO_LANELET, "lanelet 10: bound: inf is not finite"),
+    ('ref="11"', 'ref="next"', NO_LANELET, "lanelet 10: successor: 'next' is not an integer"),
+    ("<color>red", "<color>pink", NO_LIGHT, "trafficLight 30: color: unknown colors ['pink']"),
+    ("<duration>3</duration>", "", NO_LIGHT, "trafficLight 30: duration"),
+])  # fmt: skip
 def test_commonroad_odd_things(old: str, new: str, kind: str, example: str, tmp_path: Path) -> None:
     light = (
         '<trafficLight id="30"><cycle><cycleElement><duration>3</duration><color>red</color></cycleElement>'

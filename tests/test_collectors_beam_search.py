@@ -133,15 +133,12 @@ class Drawing(Walk):
         return out.set(X, out.get(X) + drawn + torch.rand(drawn.shape))
 
 
-@pytest.mark.parametrize(
-    ("env", "why"),
-    [
-        (lambda: SerialEnv(2, Walk), "batch-locked"),
-        (lambda: ParallelEnv(1, Walk, mp_start_method="forkserver"), "batch-locked"),
-        (lambda: TransformedEnv(Counting(), StepCounter()), r"another \('agents', 'x'\) when stepped"),
-        (Counting, r"another \('agents', 'x'\) when stepped"),
-    ],
-)
+@pytest.mark.parametrize(("env", "why"), [
+    (lambda: SerialEnv(2, Walk), "batch-locked"),
+    (lambda: ParallelEnv(1, Walk, mp_start_method="forkserver"), "batch-locked"),
+    (lambda: TransformedEnv(Counting(), StepCounter()), r"another \('agents', 'x'\) when stepped"),
+    (Counting, r"another \('agents', 'x'\) when stepped"),
+])  # fmt: skip
 def test_what_remembers_can_not_be_branched(env, why):
     start = starts(Walk(), 2, branches=4).set("step_count", torch.zeros(2, 4, 1, dtype=torch.int64))
     with pytest.raises(
@@ -268,26 +265,23 @@ def test_aggregates_by_hand():
             collectors.Aggregate(*wrong)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"steps": 0}, "positive"),
-        ({"prune_every": 0}, "positive"),
-        ({"leaves": 5}, "leaves"),
-        ({"group_key": STREAM}, "takes groups"),
-        ({"group_key": "goal", "rule": collectors.ReplaceBad(0.0)}, "goal"),
-        ({"group_key": X, "rule": collectors.ReplaceBad(0.0)}, "integers, one or some per branch"),
-        ({"noise": torch.zeros(2, 2)}, "noise"),
-        ({"rule": collectors.Systematic(1.0)}, "noise"),
-        ({"rule": lambda totals, noise: totals}, "int64"),
-        ({"rule": lambda totals, noise: 1 / 0}, "ZeroDivisionError: division by zero"),
-        ({"rule": lambda totals, noise: totals.argsort(-1)[:, :2]}, "int64"),
-        ({"rule": lambda totals, noise: totals.argsort(-1) + 1}, "outside"),
-        ({"rule": lambda totals, noise: totals.argsort(-1) - 1}, "outside"),
-        ({"score": lambda td: td.get(X)}, "scores must be"),
-        ({"aggregate": lambda scores: scores.sum()}, "aggregate"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"steps": 0}, "positive"),
+    ({"prune_every": 0}, "positive"),
+    ({"leaves": 5}, "leaves"),
+    ({"group_key": STREAM}, "takes groups"),
+    ({"group_key": "goal", "rule": collectors.ReplaceBad(0.0)}, "goal"),
+    ({"group_key": X, "rule": collectors.ReplaceBad(0.0)}, "integers, one or some per branch"),
+    ({"noise": torch.zeros(2, 2)}, "noise"),
+    ({"rule": collectors.Systematic(1.0)}, "noise"),
+    ({"rule": lambda totals, noise: totals}, "int64"),
+    ({"rule": lambda totals, noise: 1 / 0}, "ZeroDivisionError: division by zero"),
+    ({"rule": lambda totals, noise: totals.argsort(-1)[:, :2]}, "int64"),
+    ({"rule": lambda totals, noise: totals.argsort(-1) + 1}, "outside"),
+    ({"rule": lambda totals, noise: totals.argsort(-1) - 1}, "outside"),
+    ({"score": lambda td: td.get(X)}, "scores must be"),
+    ({"aggregate": lambda scores: scores.sum()}, "aggregate"),
+])  # fmt: skip
 def test_contradictions_are_errors(changes, message):
     start = starts(Walk(), 2, branches=4)
     with pytest.raises(ValueError, match=message):

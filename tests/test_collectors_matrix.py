@@ -80,16 +80,13 @@ def assert_same_until_done(env: Callable[[], envs.EnvBase], policy: Any, **kwarg
     return found
 
 
-@pytest.mark.parametrize(
-    ("env", "transforms", "inside"),
-    [
-        (e, t, inside)
-        for e, t, inside in itertools.product(ENVIRONMENTS, TRANSFORMS, (False, True))
-        # TorchRL's CatFrames takes no reset of each agent apart.
-        if (t == "statistics") == (e == "endless") and (e, t) != ("agents", "frames")
-        if not inside or e not in ("one", "own batch")
-    ],
-)
+@pytest.mark.parametrize(("env", "transforms", "inside"), [
+    (e, t, inside)
+    for e, t, inside in itertools.product(ENVIRONMENTS, TRANSFORMS, (False, True))
+    # TorchRL's CatFrames takes no reset of each agent apart.
+    if (t == "statistics") == (e == "endless") and (e, t) != ("agents", "frames")
+    if not inside or e not in ("one", "own batch")
+])  # fmt: skip
 def test_one_branch_is_torchrls_collector(env, transforms, inside):
     # Statistics are of all rows, also of those that are reset: here no row is.
     key = OBSERVED.get(env, "observation")

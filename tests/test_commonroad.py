@@ -67,15 +67,12 @@ TURNED = (
 )
 
 
-@pytest.mark.parametrize(
-    ("shape", "size", "place", "turn"),
-    [
-        (RECTANGLE, (4.5, 2), (0, 0), 0),
-        ("<circle><radius>0.4</radius></circle>", (0.8, 0.8), (0, 0), 0),
-        (f"<polygon>{POLYGON}</polygon>", (3, 1), (1.5, 0.5), 0),
-        (TURNED, (4, 2), (1, 0.2), 0.5),
-    ],
-)
+@pytest.mark.parametrize(("shape", "size", "place", "turn"), [
+    (RECTANGLE, (4.5, 2), (0, 0), 0),
+    ("<circle><radius>0.4</radius></circle>", (0.8, 0.8), (0, 0), 0),
+    (f"<polygon>{POLYGON}</polygon>", (3, 1), (1.5, 0.5), 0),
+    (TURNED, (4, 2), (1, 0.2), 0.5),
+])  # fmt: skip
 def test_boxes_bound_their_shape(path, shape, size, place, turn):
     heading = 0.7
     other = obstacle(8, [state(k, 20, 3, heading, 2.0) for k in range(5)], shape=shape)

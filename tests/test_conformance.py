@@ -45,16 +45,13 @@ def test_readers_conform(tmp_path: Path) -> None:
 
 
 @pytest.mark.samples
-@pytest.mark.parametrize(
-    ("name", "pattern", "count"),
-    [
-        ("womd", "womd/*.tfrecord", 1),
-        ("commonroad", "commonroad/*.xml", 5),
-        ("scenarionet", "real/scenarionet/*.pkl", 4),
-        ("commonroad", "commonroad/ngsim/USA_Lanker-2_1[01]*.xml", 2),
-        pytest.param("argoverse2", "argoverse2/*.parquet", 1, marks=needs_pyarrow),
-    ],
-)
+@pytest.mark.parametrize(("name", "pattern", "count"), [
+    ("womd", "womd/*.tfrecord", 1),
+    ("commonroad", "commonroad/*.xml", 5),
+    ("scenarionet", "real/scenarionet/*.pkl", 4),
+    ("commonroad", "commonroad/ngsim/USA_Lanker-2_1[01]*.xml", 2),
+    pytest.param("argoverse2", "argoverse2/*.parquet", 1, marks=needs_pyarrow),
+])  # fmt: skip
 def test_samples_conform(name: str, pattern: str, count: int, samples: Path) -> None:
     files = sorted(samples.glob(pattern))[: count if name == "scenarionet" else None]
     if name == "scenarionet" and not files:
@@ -202,18 +199,15 @@ class LinesReader(Reader):
             yield found.replace(file="", source="womd") if self.fault == "anonymous" else found
 
 
-@pytest.mark.parametrize(
-    ("fault", "expected"),
-    [
-        ("", set()),
-        ("another each time", {"determinism"}),
-        ("one name", {"ids"}),
-        ("anonymous", {"source"}),
-        ("blames another", {"errors"}),
-        ("silent", {"errors", "segments"}),
-        ("raises", {"errors", "segments"}),
-    ],
-)
+@pytest.mark.parametrize(("fault", "expected"), [
+    ("", set()),
+    ("another each time", {"determinism"}),
+    ("one name", {"ids"}),
+    ("anonymous", {"source"}),
+    ("blames another", {"errors"}),
+    ("silent", {"errors", "segments"}),
+    ("raises", {"errors", "segments"}),
+])  # fmt: skip
 def test_readers_that_break_a_promise(fault: str, expected: set[str], tmp_path: Path) -> None:
     paths = [tmp_path / f"{name}.lines" for name in ("a", "b")]
     paths[0].write_text("3\n4\n")

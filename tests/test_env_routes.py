@@ -371,19 +371,16 @@ def test_who_drives_under_a_bridge_has_no_route_over_it():
         np.testing.assert_allclose(table.line(0)[:, 1], lane[0, 1] + aside, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("ahead", "aside", "speed", "its_speed", "enters"),
-    [
-        (5.6, 0.0, 0.0, 0.0, True),
-        (5.4, 0.0, 0.0, 0.0, False),  # 0.9 m between them
-        (9.0, 0.0, 10.0, 0.0, False),  # it would be there in half a second
-        (9.0, 0.0, 10.0, 10.0, True),
-        (-9.0, 0.0, 0.0, 9.0, False),  # who comes from behind
-        (-9.0, 4.0, 0.0, 9.0, True),
-        (13.0, 0.0, 9.0, 0.0, False),  # in a second
-        (15.0, 0.0, 9.0, 0.0, True),
-    ],
-)
+@pytest.mark.parametrize(("ahead", "aside", "speed", "its_speed", "enters"), [
+    (5.6, 0.0, 0.0, 0.0, True),
+    (5.4, 0.0, 0.0, 0.0, False),  # 0.9 m between them
+    (9.0, 0.0, 10.0, 0.0, False),  # it would be there in half a second
+    (9.0, 0.0, 10.0, 10.0, True),
+    (-9.0, 0.0, 0.0, 9.0, False),  # who comes from behind
+    (-9.0, 4.0, 0.0, 9.0, True),
+    (13.0, 0.0, 9.0, 0.0, False),  # in a second
+    (15.0, 0.0, 9.0, 0.0, True),
+])  # fmt: skip
 @pytest.mark.parametrize("angle", [0.0, 2.0])
 def test_who_enters_would_meet_nobody_within_a_second(ahead, aside, speed, its_speed, enters, angle):
     forward, left = (

@@ -62,13 +62,10 @@ def drives(store: SegmentStore, space: str, cells: int, config: EvaluateConfig) 
     evaluate(make_agent(space, cells), store, config)
 
 
-@pytest.mark.parametrize(
-    ("space", "cells", "search", "rule"),
-    [
-        *(("bicycle", 0, *how) for how in SEARCHES),
-        *(("displacement", cells, "tree", "systematic") for cells in (0, 5)),
-    ],
-)
+@pytest.mark.parametrize(("space", "cells", "search", "rule"), [
+    *(("bicycle", 0, *how) for how in SEARCHES),
+    *(("displacement", cells, "tree", "systematic") for cells in (0, 5)),
+])  # fmt: skip
 @pytest.mark.parametrize("network", ["policy", "goals", "discriminator"])
 def test_weights_that_are_not_finite_are_found_at_once(store, network, space, cells, search, rule):
     config = EvaluateConfig(rollouts=2, search=search, rule=rule)
@@ -90,14 +87,11 @@ def test_weights_that_are_not_finite_are_found_at_once(store, network, space, ce
     assert isinstance(caught.value, SymphonyError)
 
 
-@pytest.mark.parametrize(
-    ("search", "rule", "value", "batch"),
-    [
-        *((*how, math.nan, 3) for how in SEARCHES),
-        ("tree", "best", math.inf, 3),
-        ("none", "best", math.nan, 1),
-    ],
-)
+@pytest.mark.parametrize(("search", "rule", "value", "batch"), [
+    *((*how, math.nan, 3) for how in SEARCHES),
+    ("tree", "best", math.inf, 3),
+    ("none", "best", math.nan, 1),
+])  # fmt: skip
 def test_segment_and_step_are_those_where_it_began(store, search, rule, value, batch):
     good = make_agent()
     config = EvaluateConfig(rollouts=2, search=search, rule=rule, batch=batch)

@@ -59,22 +59,19 @@ def test_a_road_cut_into_pieces_is_whole_again(gaps: list[float], angle: float, 
     assert again is road
 
 
-@pytest.mark.parametrize(
-    ("what", "start", "expected"),
-    [
-        ("at the end", ((20, 0), (40, 0)), True),
-        ("just near enough", ((20 + REACH - 0.01, 0), (40, 0)), True),
-        ("too far", ((20 + REACH + 0.01, 0), (40, 0)), False),
-        ("beside it", ((20, -1.4), (40, -1.4)), True),
-        ("in the next lane", ((20, -3.5), (40, -3.5)), False),
-        ("bent a little", ((20, 0), (20 + 9 * np.cos(TURN - 0.01), 9 * np.sin(TURN - 0.01))), True),
-        ("bent too far", ((20, 0), (20 + 9 * np.cos(TURN + 0.01), 9 * np.sin(TURN + 0.01))), False),
-        ("against it", ((20, 0), (0, 0)), False),
-        ("on a bridge", ((20, 0, 5), (40, 0, 5)), False),
-        ("a point", ((20, 0),), False),
-        ("begins a metre before the end", ((19, 0), (40, 0)), True),
-    ],
-)
+@pytest.mark.parametrize(("what", "start", "expected"), [
+    ("at the end", ((20, 0), (40, 0)), True),
+    ("just near enough", ((20 + REACH - 0.01, 0), (40, 0)), True),
+    ("too far", ((20 + REACH + 0.01, 0), (40, 0)), False),
+    ("beside it", ((20, -1.4), (40, -1.4)), True),
+    ("in the next lane", ((20, -3.5), (40, -3.5)), False),
+    ("bent a little", ((20, 0), (20 + 9 * np.cos(TURN - 0.01), 9 * np.sin(TURN - 0.01))), True),
+    ("bent too far", ((20, 0), (20 + 9 * np.cos(TURN + 0.01), 9 * np.sin(TURN + 0.01))), False),
+    ("against it", ((20, 0), (0, 0)), False),
+    ("on a bridge", ((20, 0, 5), (40, 0, 5)), False),
+    ("a point", ((20, 0),), False),
+    ("begins a metre before the end", ((19, 0), (40, 0)), True),
+])  # fmt: skip
 def test_where_the_next_lane_must_begin(what: str, start: Any, expected: bool) -> None:
     road, count = joined(make_road([line((0, 0), (20, 0)), line(*start)]))
     assert (count, links(road)) == ((1, {(0, 1)}) if expected else (0, set())), what

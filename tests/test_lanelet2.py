@@ -85,19 +85,16 @@ def test_the_direction_of_ways_does_not_matter(tmp_path: Path, turned: list[bool
         np.testing.assert_allclose(road.lanes[int(lane)], same.lanes[k], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("tags", "left", "right"),
-    [
-        (DASHED, True, True),
-        (BORDER, False, False),
-        ({"type": "line_thin", "subtype": "solid_solid"}, False, False),
-        ({"type": "line_thin", "subtype": "solid", "lane_change": "yes"}, True, True),
-        ({"type": "line_thin", "subtype": "dashed", "lane_change": "no"}, False, False),
-        # The solid one is on the left of the way as drawn: it may be crossed from its other side.
-        ({"type": "line_thin", "subtype": "solid_dashed"}, True, False),
-        ({"type": "line_thin", "subtype": "dashed_solid"}, False, True),
-    ],
-)
+@pytest.mark.parametrize(("tags", "left", "right"), [
+    (DASHED, True, True),
+    (BORDER, False, False),
+    ({"type": "line_thin", "subtype": "solid_solid"}, False, False),
+    ({"type": "line_thin", "subtype": "solid", "lane_change": "yes"}, True, True),
+    ({"type": "line_thin", "subtype": "dashed", "lane_change": "no"}, False, False),
+    # The solid one is on the left of the way as drawn: it may be crossed from its other side.
+    ({"type": "line_thin", "subtype": "solid_dashed"}, True, False),
+    ({"type": "line_thin", "subtype": "dashed_solid"}, False, True),
+])  # fmt: skip
 def test_lines_that_may_be_crossed(tags: dict[str, str], left: bool, right: bool, tmp_path: Path) -> None:
     for nodes, swap in (((3, 4), False), ((4, 3), True)):
         road = road_of(tmp_path, osm(ways=WAYS | {22: (nodes, tags)}))
@@ -149,17 +146,14 @@ def test_broken_maps_are_refused_by_name(content: str, tmp_path: Path) -> None:
     assert caught.value.file in {tmp_path / "made.osm", None}
 
 
-@pytest.mark.parametrize(
-    ("content", "kind", "example"),
-    [
-        (osm().replace("<member type='way' ref='21' role='right'/>", "", 1), lanelet2.NO_LANELET, "0 ways"),
-        (osm(ways=WAYS | {21: ((1, 77), BORDER)}), lanelet2.NO_NODE, "node 77"),
-        (osm(ways=WAYS | {21: ((1,), BORDER)}), lanelet2.NO_LANELET, "two points"),
-        (with_area(PARKING, members="61o 62o"), lanelet2.NO_AREA, "is not closed"),
-        (with_area(PARKING, members="61o 62o 63o 64o 65o"), lanelet2.NO_AREA, "2 outlines"),
-        (with_area(PARKING, members="61o 99o"), lanelet2.NO_AREA, "there is no way 99"),
-    ],
-)
+@pytest.mark.parametrize(("content", "kind", "example"), [
+    (osm().replace("<member type='way' ref='21' role='right'/>", "", 1), lanelet2.NO_LANELET, "0 ways"),
+    (osm(ways=WAYS | {21: ((1, 77), BORDER)}), lanelet2.NO_NODE, "node 77"),
+    (osm(ways=WAYS | {21: ((1,), BORDER)}), lanelet2.NO_LANELET, "two points"),
+    (with_area(PARKING, members="61o 62o"), lanelet2.NO_AREA, "is not closed"),
+    (with_area(PARKING, members="61o 62o 63o 64o 65o"), lanelet2.NO_AREA, "2 outlines"),
+    (with_area(PARKING, members="61o 99o"), lanelet2.NO_AREA, "there is no way 99"),
+])  # fmt: skip
 def test_what_a_map_lacks_is_left_out(content: str, kind: str, example: str, tmp_path: Path) -> None:
     source = read(tmp_path, content)
     assert example in source.odd[kind]
@@ -171,14 +165,11 @@ def test_what_a_map_lacks_is_left_out(content: str, kind: str, example: str, tmp
 # Projections
 
 
-@pytest.mark.parametrize(
-    ("origin", "place", "by_utm", "by_mercator"),
-    [
-        ((0, 0), (0.0085, 0.0102), (1136.5711, 940.7946), (1135.4588, 946.2157)),
-        ((49.01160993928274, 8.43856470258739), (49.0125, 8.4401), (112.9986, 98.1141), (112.0999, 99.0820)),
-        ((-33.9, 151.2), (-33.91, 151.21), (944.0642, -1092.8055), (923.9654, -1113.2602)),
-    ],
-)
+@pytest.mark.parametrize(("origin", "place", "by_utm", "by_mercator"), [
+    ((0, 0), (0.0085, 0.0102), (1136.5711, 940.7946), (1135.4588, 946.2157)),
+    ((49.01160993928274, 8.43856470258739), (49.0125, 8.4401), (112.9986, 98.1141), (112.0999, 99.0820)),
+    ((-33.9, 151.2), (-33.91, 151.21), (944.0642, -1092.8055), (923.9654, -1113.2602)),
+])  # fmt: skip
 def test_agrees_with_proj(origin: Any, place: Any, by_utm: Any, by_mercator: Any) -> None:
     """PROJ 9: ``+proj=utm +zone=N``, and ``+proj=merc +R=6378137 +lat_ts=<origin>``, minus the origin."""
     for project, expected in ((utm, by_utm), (mercator, by_mercator)):

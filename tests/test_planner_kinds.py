@@ -127,19 +127,16 @@ def test_equal_planners_of_every_kind_drive_alike(store: Path, tmp_path: Path) -
     assert found["file"].about.drivers["ego"] == kinds["file"]
 
 
-@pytest.mark.parametrize(
-    ("kind", "said", "why"),
-    [
-        ("says", '{"step": 2, "plan": [NaN, 0.0]}', "step 2: .*not finite"),
-        ("says", "[-1.0, 0.0]", 'step 2: ValueError: answered .* not {"step": 2, '),
-        ("says", '{"error": "lost my way"}', "step 2: RuntimeError: lost my way"),
-        ("says", "what?", "step 2: JSONDecodeError"),
-        ("flood", "", "step 2: .*an answer of more than 1048576 bytes"),
-        ("binary", "", "step 2: .*(UnicodeDecodeError|JSONDecodeError|more than one line)"),
-        ("debug", "", "step 2: .*(more than one line for an answer|answered)"),
-        ("twice", "", "step [23]: .*(more than one line for an answer|answered)"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "said", "why"), [
+    ("says", '{"step": 2, "plan": [NaN, 0.0]}', "step 2: .*not finite"),
+    ("says", "[-1.0, 0.0]", 'step 2: ValueError: answered .* not {"step": 2, '),
+    ("says", '{"error": "lost my way"}', "step 2: RuntimeError: lost my way"),
+    ("says", "what?", "step 2: JSONDecodeError"),
+    ("flood", "", "step 2: .*an answer of more than 1048576 bytes"),
+    ("binary", "", "step 2: .*(UnicodeDecodeError|JSONDecodeError|more than one line)"),
+    ("debug", "", "step 2: .*(more than one line for an answer|answered)"),
+    ("twice", "", "step [23]: .*(more than one line for an answer|answered)"),
+])  # fmt: skip
 def test_what_a_process_says_wrong_fails_the_run(store, tmp_path, kind, said, why):
     for saved in alone(store, tmp_path / "sim", process(tmp_path, kind, said)):
         assert re.search(why, saved.failed[0]), saved.failed
@@ -195,9 +192,8 @@ def test_one_that_takes_too_long_fails_its_run(store: Path, tmp_path: Path, how:
         return 0.0, 0.0
 
     for saved in alone(store, tmp_path / "sim", slow, planner_seconds=0.1):
-        assert saved.failed[0].startswith(
-            f"step 3: TimeoutError: took more than 0.1 s ({Path(__file__).name}:"
-        )
+        late = f"step 3: TimeoutError: took more than 0.1 s ({Path(__file__).name}:"
+        assert saved.failed[0].startswith(late)
         assert saved.counted[0].sum() == 3
 
 
@@ -226,9 +222,8 @@ def test_the_observation_is_all_in_si_units(store: Path, tmp_path: Path) -> None
         segment = saved.segment
         others = segment.valid[:, t] & (np.arange(segment.num_agents) != segment.ego)
         assert (one.time, one.dt) == (pytest.approx(t * segment.dt), pytest.approx(segment.dt))
-        np.testing.assert_allclose(
-            one.ego, [*saved.state[0, t, 0], *segment.size[segment.ego, :2]], atol=1e-4
-        )
+        ego = [*saved.state[0, t, 0], *segment.size[segment.ego, :2]]
+        np.testing.assert_allclose(one.ego, ego, atol=1e-4)
         for (x, y), logged in (
             ((agents.x, agents.y), segment.position[others, t, :2]),
             ((agents.vx, agents.vy), segment.velocity[others, t]),
@@ -243,36 +238,32 @@ def test_the_observation_is_all_in_si_units(store: Path, tmp_path: Path) -> None
 
 
 FINE = dict.fromkeys(
-    ("failed", "at_fault_collision", "red_lights", "offroad_time", "beyond_route", "no_route"), 0
+    ["failed", "at_fault_collision", "red_lights", "offroad_time", "beyond_route", "no_route"], 0
 )
 
 
-@pytest.mark.parametrize(
-    ("changes", "score"),
-    [
-        ({}, 50.0),
-        ({"progress_ratio": 1.4}, 100.0),
-        ({"progress_ratio": -0.1}, 0.0),
-        ({"progress_ratio": None}, 100.0),
-        ({"progress_ratio": None, "beyond_route": 1, "no_route": 0}, None),
-        ({"progress_ratio": None, "beyond_route": 0, "no_route": 1}, None),
-        ({"progress_ratio": None, "beyond_route": 1, "at_fault_collision": True}, 0.0),
-        ({"progress_ratio": None, "beyond_route": None, "failed": "why"}, 0.0),
-        ({"collision": True}, 50.0),
-        ({"red_lights": 1}, 0.0),
-        ({"offroad_time": 2.0}, 0.0),
-    ],
-)
+@pytest.mark.parametrize(("changes", "score"), [
+    ({}, 50.0),
+    ({"progress_ratio": 1.4}, 100.0),
+    ({"progress_ratio": -0.1}, 0.0),
+    ({"progress_ratio": None}, 100.0),
+    ({"progress_ratio": None, "beyond_route": 1, "no_route": 0}, None),
+    ({"progress_ratio": None, "beyond_route": 0, "no_route": 1}, None),
+    ({"progress_ratio": None, "beyond_route": 1, "at_fault_collision": True}, 0.0),
+    ({"progress_ratio": None, "beyond_route": None, "failed": "why"}, 0.0),
+    ({"collision": True}, 50.0),
+    ({"red_lights": 1}, 0.0),
+    ({"offroad_time": 2.0}, 0.0),
+])  # fmt: skip
 def test_the_score_of_a_run(changes: dict[str, Any], score: float | None) -> None:
     assert run_score({**FINE, "progress_ratio": 0.5, **changes}) == score
 
 
 def test_the_command_compares_planners_among_crowds(store, tmp_path, capsys):
     words = ["--data", str(store), "--rollouts", "2", "--search", "none", "--duration", "2"]
-    places = []
-    for name in ("idm", "log"):
-        places.append(str(tmp_path / name))
-        assert main(["simulate", AGENT, "--planner", name, *words, "--out", places[-1]]) == 0
+    places = [str(tmp_path / name) for name in ("idm", "log")]
+    for name, place in zip(("idm", "log"), places, strict=True):
+        assert main(["simulate", AGENT, "--planner", name, *words, "--out", place]) == 0
     capsys.readouterr()
     assert main(["planners", *places, "--json", "-"]) == 0
     records = json.loads(capsys.readouterr().out)["records"]
@@ -314,14 +305,10 @@ def test_runs_without_defined_progress_have_no_score(tmp_path: Path) -> None:
     fill(tmp_path / "store", [driven(name, *place) for name, place in where.items()])
     record = planner_record(alone(tmp_path / "store", tmp_path / "sim", hurries))
     runs = {one["segment"]: one for one in record["per_run"]}
-    assert {
-        name: (one["progress_ratio"], one["beyond_route"], one["no_route"]) for name, one in runs.items()
-    } == {
-        "way": (pytest.approx(1.5, abs=0.05), 0, 0),
-        "beside": (None, 0, 1),
-        "stands": (None, 0, 0),
-        "end": (None, 1, 0),
-    }
+    names = ("progress_ratio", "beyond_route", "no_route")
+    found = {key: tuple(one[name] for name in names) for key, one in runs.items()}
+    assert found.pop("way") == (pytest.approx(1.5, abs=0.05), 0, 0)
+    assert found == {"beside": (None, 0, 1), "stands": (None, 0, 0), "end": (None, 1, 0)}
     assert (record["score"], record["score_runs"]) == (pytest.approx(100, abs=0.01), 2)
     assert record["progress_ratio"] == runs["way"]["progress_ratio"]
     record["planner"] = "hurries"

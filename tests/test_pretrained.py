@@ -115,15 +115,12 @@ def test_the_command_prints_every_card(made, capsys):
 OTHERS = "there are: pretrained:other, pretrained:tiny"
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("pretrained:tinny", f"did you mean 'pretrained:tiny'\\? {OTHERS}"),
-        ("pretrained:", f"no agent 'pretrained:' comes with this package; {OTHERS}"),
-        ("pretrained:../pretrained/tiny", "no agent"),
-        ("pretrained:tiny@3", "has no checkpoint yet"),
-    ],
-)
+@pytest.mark.parametrize(("name", "message"), [
+    ("pretrained:tinny", f"did you mean 'pretrained:tiny'\\? {OTHERS}"),
+    ("pretrained:", f"no agent 'pretrained:' comes with this package; {OTHERS}"),
+    ("pretrained:../pretrained/tiny", "no agent"),
+    ("pretrained:tiny@3", "has no checkpoint yet"),
+])  # fmt: skip
 def test_unknown_names(name, message, tmp_path, monkeypatch):
     monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
     for known in ("tiny", "other"):

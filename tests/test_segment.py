@@ -127,27 +127,24 @@ def across(times: int) -> RunSegment:
     return FULL.replace(road=road)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *(("segment_id", text) for text in ("a/b", "", "a\x1b[31m")),
-        *(("dt", dt) for dt in (0.0, float("nan"), -0.1, 0.001)),
-        *(("ego", ego) for ego in (-1, 4)),
-        *(("current_step", step) for step in (6, -1)),
-        ("agent_id", np.zeros(4, np.int64)),
-        *(("size", np.full((4, 3), side, np.float32)) for side in (0, 101, 1e-3)),
-        ("position", np.full((4, 6, 3), 20_001, np.float32)),
-        ("velocity", FULL.velocity + np.float32(3e38)),
-        ("heading", FULL.heading + np.float32(2e3)),
-        ("valid", np.ones(6, bool)),
-        ("valid", np.ones((4, 10_001), bool)),
-        ("origin", FULL.origin + 1e30),
-        ("group", "\ud800"),
-        ("file", "x" * 300),
-        ("source", "\udc80"),
-        ("road.speed_limit", np.full(3, 1e6, np.float32)),
-    ],
-)
+@pytest.mark.parametrize(("name", "value"), [
+    *(("segment_id", text) for text in ("a/b", "", "a\x1b[31m")),
+    *(("dt", dt) for dt in (0.0, float("nan"), -0.1, 0.001)),
+    *(("ego", ego) for ego in (-1, 4)),
+    *(("current_step", step) for step in (6, -1)),
+    ("agent_id", np.zeros(4, np.int64)),
+    *(("size", np.full((4, 3), side, np.float32)) for side in (0, 101, 1e-3)),
+    ("position", np.full((4, 6, 3), 20_001, np.float32)),
+    ("velocity", FULL.velocity + np.float32(3e38)),
+    ("heading", FULL.heading + np.float32(2e3)),
+    ("valid", np.ones(6, bool)),
+    ("valid", np.ones((4, 10_001), bool)),
+    ("origin", FULL.origin + 1e30),
+    ("group", "\ud800"),
+    ("file", "x" * 300),
+    ("source", "\udc80"),
+    ("road.speed_limit", np.full(3, 1e6, np.float32)),
+])  # fmt: skip
 def test_faults_are_named(name: str, value: Any) -> None:
     assert refused(changed(name, value)) == name
 

@@ -113,15 +113,12 @@ def test_checksum_ignores_order_and_layout_and_report(tmp_path: Path) -> None:
     assert len({SegmentStore(tmp_path / name).checksum() for name in "acd"}) == 3
 
 
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"dt": -1.0}, "dt"),
-        ({"agent_id": np.arange(3, dtype=np.int32)}, "agent_id"),
-        ({"heading": np.full((3, 51), np.nan, np.float32)}, "heading"),
-        ({"segment_id": "r0"}, "segment_id"),
-    ],
-)
+@pytest.mark.parametrize(("change", "field"), [
+    ({"dt": -1.0}, "dt"),
+    ({"agent_id": np.arange(3, dtype=np.int32)}, "agent_id"),
+    ({"heading": np.full((3, 51), np.nan, np.float32)}, "heading"),
+    ({"segment_id": "r0"}, "segment_id"),
+])  # fmt: skip
 def test_what_is_refused_leaves_no_trace(folder: Path, change: dict[str, Any], field: str) -> None:
     found = unlike(3)
     with StoreWriter(folder) as writer:
@@ -359,16 +356,13 @@ def rehash(filled: Path) -> None:
     index.write_bytes(records.tobytes())
 
 
-@pytest.mark.parametrize(
-    ("column", "data", "field"),
-    [
-        ("heading", np.float32(np.nan).tobytes(), "heading"),
-        ("agent_type", b"\x77", "agent_type"),
-        ("lanes.points", np.float32(1e30).tobytes(), "road.lanes"),
-        ("lanes.offsets", np.int64(7).tobytes(), "road.lanes"),
-        ("successors", np.int32(-5).tobytes(), "road.successors"),
-    ],
-)
+@pytest.mark.parametrize(("column", "data", "field"), [
+    ("heading", np.float32(np.nan).tobytes(), "heading"),
+    ("agent_type", b"\x77", "agent_type"),
+    ("lanes.points", np.float32(1e30).tobytes(), "road.lanes"),
+    ("lanes.offsets", np.int64(7).tobytes(), "road.lanes"),
+    ("successors", np.int32(-5).tobytes(), "road.successors"),
+])  # fmt: skip
 def test_what_breaks_the_schema_is_refused(filled: Path, column: str, data: bytes, field: str) -> None:
     change(filled / "columns" / f"{column}.bin", 0, data)
     rehash(filled)

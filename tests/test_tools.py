@@ -55,14 +55,11 @@ def test_nothing_but_errors_of_ours(name: str, tmp_path: Path, monkeypatch: pyte
     assert counts.outcomes["refused"] > INPUTS / 10
 
 
-@pytest.mark.parametrize(
-    ("which", "number"),
-    [
-        ("argoverse2", 3613),  # Arrow ended the process when it was asked for the size of a damaged column
-        ("rollouts", 1700),  # settings that are infinite
-        ("rollouts", 40),  # facts that are nested 100 000 deep
-    ],
-)
+@pytest.mark.parametrize(("which", "number"), [
+    ("argoverse2", 3613),  # Arrow ended the process when it was asked for the size of a damaged column
+    ("rollouts", 1700),  # settings that are infinite
+    ("rollouts", 40),  # facts that are nested 100 000 deep
+])  # fmt: skip
 def test_what_was_found_stays_mended(which: str, number: int, tmp_path: Path) -> None:
     skip_without_its_package(which)
     assert attempt(TARGETS[which], inputs(which, 7, number), tmp_path)[0] in {"accepted", "refused"}

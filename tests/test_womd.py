@@ -129,29 +129,26 @@ def test_lanes_without_points_and_edges_of_one_go_with_all_that_refers_to_them(p
     assert len(road.boundary) == len(segment.signal_lane) == 0
 
 
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        (lambda s: s.ClearField("scenario_id"), "scenario_id"),
-        (lambda s: s.timestamps_seconds.__setitem__(2, 0.9), "timestamps_seconds"),
-        (lambda s: s.timestamps_seconds.__setitem__(2, np.nan), "timestamps_seconds"),
-        (lambda s: s.ClearField("tracks"), "tracks"),
-        (lambda s: s.tracks[0].states.pop(), "tracks.states"),
-        (lambda s: setattr(s.tracks[1], "object_type", 9), "tracks.object_type"),
-        (lambda s: setattr(s, "sdc_track_index", 3), "sdc_track_index"),
-        (lambda s: [setattr(x, "valid", False) for x in s.tracks[2].states], "sdc_track_index"),
-        (lambda s: setattr(s, "current_time_index", 5), "current_time_index"),
-        (lambda s: s.tracks_to_predict.add(track_index=7), "tracks_to_predict"),
-        (lambda s: s.dynamic_map_states.pop(), "dynamic_map_states"),
-        (lambda s: setattr(s.dynamic_map_states[0].lane_states[0], "state", 260), "dynamic_map_states.state"),
-        (lambda s: setattr(s.map_features[0].lane, "type", 4), "map_features.lane.type"),
-        # What the schema forbids.
-        (lambda s: setattr(s.tracks[1], "id", 100), "agent_id"),
-        (lambda s: setattr(s, "scenario_id", "a/b"), "segment_id"),
-        (lambda s: setattr(s.map_features[1], "id", 10), "road.lane_id"),
-        (lambda s: setattr(s.map_features[0].lane, "speed_limit_mph", -5), "road.speed_limit"),
-    ],
-)
+@pytest.mark.parametrize(("change", "field"), [
+    (lambda s: s.ClearField("scenario_id"), "scenario_id"),
+    (lambda s: s.timestamps_seconds.__setitem__(2, 0.9), "timestamps_seconds"),
+    (lambda s: s.timestamps_seconds.__setitem__(2, np.nan), "timestamps_seconds"),
+    (lambda s: s.ClearField("tracks"), "tracks"),
+    (lambda s: s.tracks[0].states.pop(), "tracks.states"),
+    (lambda s: setattr(s.tracks[1], "object_type", 9), "tracks.object_type"),
+    (lambda s: setattr(s, "sdc_track_index", 3), "sdc_track_index"),
+    (lambda s: [setattr(x, "valid", False) for x in s.tracks[2].states], "sdc_track_index"),
+    (lambda s: setattr(s, "current_time_index", 5), "current_time_index"),
+    (lambda s: s.tracks_to_predict.add(track_index=7), "tracks_to_predict"),
+    (lambda s: s.dynamic_map_states.pop(), "dynamic_map_states"),
+    (lambda s: setattr(s.dynamic_map_states[0].lane_states[0], "state", 260), "dynamic_map_states.state"),
+    (lambda s: setattr(s.map_features[0].lane, "type", 4), "map_features.lane.type"),
+    # What the schema forbids.
+    (lambda s: setattr(s.tracks[1], "id", 100), "agent_id"),
+    (lambda s: setattr(s, "scenario_id", "a/b"), "segment_id"),
+    (lambda s: setattr(s.map_features[1], "id", 10), "road.lane_id"),
+    (lambda s: setattr(s.map_features[0].lane, "speed_limit_mph", -5), "road.speed_limit"),
+])  # fmt: skip
 def test_what_is_forbidden_is_named(path: Path, change: Change, field: str) -> None:
     scenario = womd_scenario()
     change(scenario)
@@ -162,17 +159,14 @@ def test_what_is_forbidden_is_named(path: Path, change: Change, field: str) -> N
     assert error.segment == (scenario.scenario_id or None)
 
 
-@pytest.mark.parametrize(
-    ("change", "kind"),
-    [
-        (lambda s: setattr(s.tracks[0].states[2], "center_x", np.nan), WILD),
-        (lambda s: setattr(s.tracks[0].states[2], "center_y", 1e6), WILD),
-        (lambda s: setattr(s.tracks[0].states[2], "heading", np.inf), WILD),
-        (lambda s: setattr(s.tracks[0].states[1], "length", 0), NO_SIZE),
-        (lambda s: setattr(s.map_features[0].lane.polyline[1], "z", np.nan), NO_LINE),
-        (lambda s: setattr(s.map_features[4].road_edge.polyline[0], "x", np.inf), NO_LINE),
-    ],
-)
+@pytest.mark.parametrize(("change", "kind"), [
+    (lambda s: setattr(s.tracks[0].states[2], "center_x", np.nan), WILD),
+    (lambda s: setattr(s.tracks[0].states[2], "center_y", 1e6), WILD),
+    (lambda s: setattr(s.tracks[0].states[2], "heading", np.inf), WILD),
+    (lambda s: setattr(s.tracks[0].states[1], "length", 0), NO_SIZE),
+    (lambda s: setattr(s.map_features[0].lane.polyline[1], "z", np.nan), NO_LINE),
+    (lambda s: setattr(s.map_features[4].road_edge.polyline[0], "x", np.inf), NO_LINE),
+])  # fmt: skip
 def test_single_odd_things_are_left_out(path: Path, change: Change, kind: str) -> None:
     scenario = womd_scenario()
     whole = convert(path, scenario)
