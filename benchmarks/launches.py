@@ -8,6 +8,7 @@ compiled counts as one.
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ from typing import Any
 from unittest import mock
 
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 from symphony.agents import build_agent
 from symphony.collectors import KeepBest
@@ -28,6 +29,8 @@ from symphony.envs import Bicycle, DrivingEnv
 from symphony.learning.demonstrations import SceneDataset
 from symphony.rollouts.search import search
 from workloads import update
+
+BEAM_SEARCH = importlib.import_module("symphony.collectors.beam_search")
 
 METHODS = ("bc", "bc_h", "mgail_h")
 
@@ -44,6 +47,16 @@ class Launches(TorchDispatchMode):
         self.counts[self.part] += not func.is_view
         return func(*args, **(kwargs or {}))
 
+    def program(self, step: Callable[..., Any]) -> Callable[..., Any]:
+        """A compiled function that counts one each time it runs."""
+
+        def run(*args: Any) -> Any:
+            self.counts["compiled step"] += 1
+            with _disable_current_modes():
+                return step(*args)
+
+        return run
+
     def of(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """A function whose operators count for a part."""
 
@@ -58,11 +71,15 @@ class Launches(TorchDispatchMode):
         return call
 
 
+def _elsewhere(_tensor: Any) -> bool:
+    return False
+
+
 @contextmanager
 def as_on_a_device() -> Iterator[None]:
     """Nothing of the package looks at numbers inside."""
     patches = [
-        mock.patch.object(module, "on_host", return_value=False)
+        mock.patch.object(module, "on_host", _elsewhere)
         for name, module in list(sys.modules.items())
         if name.startswith("symphony.") and hasattr(module, "on_host")
     ]
@@ -76,7 +93,7 @@ def as_on_a_device() -> Iterator[None]:
 
 
 @torch.no_grad()
-def of_a_search_step(scenes: int = 2, branches: int = 2) -> Counter[str]:
+def of_a_search_step(scenes: int = 2, branches: int = 2, *, compiled: bool = False) -> Counter[str]:
     """By part, rounded up, of an agent with goals, foresight and a discriminator."""
     spec = AgentSpec(
         action_space="bicycle",
@@ -91,14 +108,22 @@ def of_a_search_step(scenes: int = 2, branches: int = 2) -> Counter[str]:
     scene = torch.arange(scenes)[:, None].expand(-1, branches)
     goal = env.scenes.route_logged[scene]
     start = env.start(scene, torch.arange(branches).expand(scene.shape), goal)
-    env._step = launches.of("environment", env._step)  # type: ignore[method-assign]
     assert agent.discriminator is not None
-    for name, network in (("policy", agent.policy), ("discriminator", agent.discriminator)):
-        network.forward = launches.of(name, network.forward)  # type: ignore[method-assign]
-    rule = KeepBest(0.5)
+    if not compiled:
+        env._step = launches.of("environment", env._step)  # type: ignore[method-assign]
+        for name, network in (("policy", agent.policy), ("discriminator", agent.discriminator)):
+            network.forward = launches.of(name, network.forward)  # type: ignore[method-assign]
+    how: dict[str, Any] = {"seed": 0, "rule": KeepBest(0.5), "prune_every": 10}
+    how["compile_step"] = {"backend": "eager"} if compiled else False
+    made = BEAM_SEARCH._compiled
+    one = mock.patch.object(BEAM_SEARCH, "_compiled", lambda *how: launches.program(made(*how)))
 
-    with as_on_a_device(), launches:
-        search(env, agent.policy, agent.discriminator, start, seed=0, rule=rule, prune_every=10)
+    with as_on_a_device(), one:
+        if compiled:  # compiled before anything is counted
+            search(env, agent.policy, agent.discriminator, start, **how)
+            launches.counts.clear()
+        with launches:
+            search(env, agent.policy, agent.discriminator, start, **how)
     return Counter({part: -(-count // env.decisions) for part, count in launches.counts.items()})
 
 
@@ -114,8 +139,8 @@ def main() -> None:
     """Print them."""
     step = of_a_search_step()
     parts = ", ".join(f"{part} {count}" for part, count in step.most_common())
-    outside = step.total() - step["environment"] + 1
-    print(f"a step of a search: {step.total()} ({parts}); {outside} with the environment compiled")
+    compiled = of_a_search_step(compiled=True).total()
+    print(f"a step of a search: {step.total()} ({parts}); {compiled} with the step compiled")
     for method in METHODS:
         print(f"an update of {method}: {of_an_update(method)}")
 

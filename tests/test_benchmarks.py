@@ -97,4 +97,5 @@ def test_a_step_and_an_update_start_no_more_operators_than_they_did(program: Any
     step = launches.of_a_search_step()
     assert step["environment"] <= 830
     assert step.total() - step["environment"] <= 200
+    assert launches.of_a_search_step(compiled=True).total() <= 40
     assert launches.of_an_update("bc") <= 3700

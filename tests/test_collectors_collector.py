@@ -332,3 +332,21 @@ def test_collectors_and_objectives_stand_alone():
                 assert name.startswith(f"symphony.{package}") or first in allowed, (source.name, name)
                 private = first == "torchrl" and any(part.startswith("_") for part in rest)
                 assert not private, (source.name, name)
+
+
+@pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
+def test_a_compiled_search_is_the_search_and_compiled_once():
+    torch.compiler.reset()
+    graphs = []
+
+    def backend(graph, _):
+        graphs.append(graph)
+        return graph.forward
+
+    plain = make(policy=Policy())
+    compiled = make(policy=Policy(), compile_step={"backend": backend})
+    for collector in (plain, compiled):
+        collector.set_seed(3)
+    for _ in range(2):
+        assert_same(compiled.next(), plain.next())
+    assert len(graphs) == 1

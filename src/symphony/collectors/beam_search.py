@@ -6,8 +6,9 @@ scores of its steps and agents; the branches with *high* totals are dropped and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -111,6 +112,7 @@ def beam_search(
     keep: Sequence[NestedKey] | None = None,
     keep_tree: bool = False,
     leaves: int | None = None,
+    compile_step: bool | Mapping[str, Any] = False,
     exploration_type: ExplorationType | None = ExplorationType.RANDOM,
 ) -> BeamSearchResult:
     """Search an environment whose whole state is in the TensorDict: those with high scores of the S branches of each
@@ -147,6 +149,8 @@ def beam_search(
         keep: entries kept of each step, e.g. ``[("next", "agents", "state")]``; default all.
         keep_tree: also return the branches that were pruned.
         leaves: return only so many, the best by their `leaf_costs` first; default all, in the order of their slots.
+        compile_step: compile policy, environment and score of a step as one program, or how, as
+            :func:`torch.compile` takes it.
         exploration_type: under which the policy runs.
 
     Raises:
@@ -160,7 +164,10 @@ def beam_search(
         raise ValueError(f"leaves must be 1 ... {branches} branches, is {leaves}")
     check_branching(env, start)
     whole = branched_env(env, start.shape)
-    simulation = Simulation(env, whole, start.shape, policy, score, aggregate, keep, until_done)
+    one_step = _compiled(whole, compile_step) if compile_step else _step
+    simulation = Simulation(
+        env, whole, start.shape, policy, score, aggregate, keep, until_done, one_step, start
+    )
     ended = _ended(env, start, start.ndim)
     with set_exploration_type(exploration_type), branched_specs(policy, start.shape[:-1], start.shape):
         if isinstance(rule, Backtrack):
@@ -248,6 +255,8 @@ class Simulation:
     aggregate: Aggregation
     keep: Sequence[NestedKey] | None
     until_done: bool
+    step: Callable[..., tuple[TensorDictBase, TensorDictBase, Tensor, Tensor]]
+    start: TensorDictBase
 
     def run(self, now: TensorDictBase, ended: Bool[Tensor, "*b S K"], length: int) -> Run:
         """A period of some steps."""
@@ -256,12 +265,11 @@ class Simulation:
         # Policy and environment write into the TensorDict they are given.
         now, records, scores, ends = now.copy(), [], [], [ended]
         for _ in range(length):
-            stepped = env.step(self.policy(now))
-            now = env.step_mdp(stepped)
-            records.append(stepped if self.keep is None else stepped.select(*self.keep))
-            scores.append(self._scores(stepped, now))
-            ends.append(_ended(env, stepped.get("next"), now.ndim))
-            del stepped  # or one more set of observations lives through the next step
+            now = now if self.step is _step else _ordered(now, self.start)
+            kept, now, worth, end = self.step(env, self.policy, self.score, self.keep, now)
+            records.append(kept)
+            scores.append(worth)
+            ends.append(end)
         joined = torch.stack(scores, -2)
         if not self.until_done:
             alive = torch.ones(*joined.shape[:-1], 1, dtype=torch.bool, device=joined.device)
@@ -272,17 +280,6 @@ class Simulation:
             alive = alive.any(-1, keepdim=True)
         return Run(records, torch.where(alive, joined, 0.0), alive, over[..., -1, :], now)
 
-    def _scores(self, stepped: TensorDictBase, now: TensorDictBase) -> Float[Tensor, "*b S N"]:
-        """Scores of the state `now` that the step `stepped` led to."""
-        seen = now.copy()  # the reward is shown to the score, but is no part of the next step's input
-        for key in self.env.reward_keys:
-            seen.set(key, stepped.get(below(key)))
-        values = self.score(seen)
-        values = values.unsqueeze(-1) if values.shape == now.shape else values
-        if values.ndim != now.ndim + 1 or values.shape[:-1] != now.shape:
-            raise ValueError(f"scores must be {[*now.shape]} or one more, agents, are {[*values.shape]}")
-        return values if values.is_floating_point() else values.float()
-
     def total(self, run: Run, length: int | None = None) -> Float[Tensor, "*b S"]:
         """The totals of a period, or of its first steps alone."""
         scores, alive = run.scores[..., :length, :], run.alive[..., :length, :]
@@ -291,6 +288,42 @@ class Simulation:
         if found.shape != scores.shape[:-2]:
             raise ValueError(f"the aggregate must be {tuple(scores.shape[:-2])}, is {tuple(found.shape)}")
         return torch.where(alive[..., 0, :].any(-1), found, 0.0)
+
+
+def _step(
+    env: EnvBase, policy: Policy, score: Score, keep: Sequence[NestedKey] | None, now: TensorDictBase
+) -> tuple[TensorDictBase, TensorDictBase, Float[Tensor, "*b S N"], Bool[Tensor, "*b S K"]]:
+    """What is kept of a step, the next state, its scores, and where the episode ended; one program if compiled."""
+    stepped = env.step(policy(now))
+    now = env.step_mdp(stepped)
+    seen = now.copy()  # the reward is shown to the score, but is no part of the next step's input
+    for key in env.reward_keys:
+        seen.set(key, stepped.get(below(key)))
+    values = score(seen)
+    values = values.unsqueeze(-1) if values.shape == now.shape else values
+    if values.ndim != now.ndim + 1 or values.shape[:-1] != now.shape:
+        raise ValueError(f"scores must be {[*now.shape]} or one more, agents, are {[*values.shape]}")
+    values = values if values.is_floating_point() else values.float()
+    kept = stepped if keep is None else stepped.select(*keep)
+    return kept, now, values, _ended(env, stepped.get("next"), now.ndim)
+
+
+def _compiled(env: EnvBase, how: bool | Mapping[str, Any]) -> Callable[..., Any]:
+    _ = env._step_mdp, env.done_keys, env.reward_keys  # kept once read, on which a program depends
+    return torch.compile(_step, fullgraph=True, **(how if isinstance(how, Mapping) else {}))
+
+
+def _ordered(state: TensorDictBase, like: TensorDictBase) -> TensorDictBase:
+    """The entries that the first state has, in its order and no views: anything else would be compiled anew."""
+    entries = {}
+    for key, first in like.items():
+        value = state.get(key)
+        if isinstance(first, TensorDictBase):
+            value = _ordered(value, first)
+        elif value._is_view():
+            value = value.clone(memory_format=torch.contiguous_format)
+        entries[key] = value
+    return TensorDict(entries, state.batch_size, device=state.device)
 
 
 def _ended(env: EnvBase, state: TensorDictBase, batch: int) -> Bool[Tensor, "*b S K"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copyreg
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -51,8 +51,8 @@ class BeamSearchCollector(Collector):
         keep_tree: also return what was pruned; with ``leaves=branches`` only.
         rule_noise: ``rule_noise(start, periods)`` gives numbers in [0, 1) for rules that draw, as `noise` of
             :func:`beam_search`; by default from a generator that :meth:`set_seed` sets.
-        prune_every, rule, aggregate, value, accumulate, prune_last, until_done, slot_keys, group_key, keep: as for
-            :func:`beam_search`.
+        prune_every, rule, aggregate, value, accumulate, prune_last, until_done, slot_keys, group_key, keep,
+            compile_step: as for :func:`beam_search`.
         kwargs: as for :class:`Collector`. `frames_per_batch` is rows x L x T, `simulated_frames` S / L times as many.
     """
 
@@ -77,6 +77,7 @@ class BeamSearchCollector(Collector):
         keep: Sequence[NestedKey] | None = None,
         keep_tree: bool = False,
         rule_noise: Callable[[TensorDictBase, int], Tensor] | None = None,
+        compile_step: bool | Mapping[str, Any] = False,
         **kwargs: Any,
     ) -> None:
         if not 1 <= (1 if leaves is None else leaves) <= branches or (keep_tree and leaves != branches):
@@ -102,6 +103,7 @@ class BeamSearchCollector(Collector):
         self._search: dict[str, Any] = {"prune_every": prune_every, "rule": rule, "aggregate": aggregate}
         self._search |= {"value": value, "accumulate": accumulate, "prune_last": prune_last}
         self._search |= {"until_done": until_done, "slot_keys": slot_keys, "group_key": group_key}
+        self._search["compile_step"] = compile_step
         self._search["keep"] = None if keep is None else list(dict.fromkeys([*keep, *self._done]))
         # The leaves of a whole tree stay in the order of their slots.
         self._search |= {"keep_tree": keep_tree, "leaves": None if keep_tree else leaves or 1}

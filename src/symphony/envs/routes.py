@@ -225,7 +225,6 @@ class FollowedRoutes(NamedTuple):
         place = start[..., None] + torch.arange(WINDOW, device=start.device)
         return RouteWindow(self.points(place), place < self.length[..., None], own - start)
 
-    @torch.no_grad()
     def progress(
         self, position: Float[Tensor, "M N 2"], about: Float[Tensor, "M N"], moved: Float[Tensor, "M N"]
     ) -> Float[Tensor, "M N"]:

@@ -71,7 +71,7 @@ def nearest(squared: Float[Tensor, "*b K"], count: int) -> tuple[Int[Tensor, "*b
         index = torch.from_numpy(smallest(flat, count) % width).view(*squared.shape[:-1], count)
     else:
         index = squared.topk(count, dim=-1, largest=False, sorted=False).indices
-    found = squared.gather(-1, index).isfinite()
+    found = squared.gather(-1, index) < torch.inf
     if width < count:
         index, found = (pad(value, (0, count - width)) for value in (index, found))
     return index, found
