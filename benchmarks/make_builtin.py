@@ -86,12 +86,12 @@ def make(name: SplitName, split: Split) -> tuple[int, Counter[str], float]:
     with StoreWriter(path) as writer:
         for k, (kind, seed) in enumerate(split.networks):
             begin = time.perf_counter()
-            run = generate_run(kind, seed, DURATION)
+            found, why = generate_run(kind, seed, DURATION)
             seconds += time.perf_counter() - begin
-            accepted += len(run.segments)
-            reasons += run.reasons
+            accepted += len(found)
+            reasons += why
             count = -(-(split.segments - len(writer)) // (len(split.networks) - k))
-            for segment in choose(run.segments, count, np.random.default_rng(seed)):
+            for segment in choose(found, count, np.random.default_rng(seed)):
                 writer.append(segment, tags={"kind": kind, "network": f"{kind}-{seed}"})
     return accepted, reasons, seconds
 

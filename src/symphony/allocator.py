@@ -10,16 +10,15 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+from typing import Any
 
 
 def tune() -> bool:
     """Set the allocator of this process, before its first large tensor; return whether it was set."""
-    if (library := _ours()) is None:
-        return False
-    trim, pad, mapping = -1, -2, -3  # M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD
+    library, trim, pad, mapping = _ours(), -1, -2, -3  # M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD
     # Older versions take no mapping threshold above 32 MiB.
-    mapped = library.mallopt(mapping, 1 << 30) or library.mallopt(mapping, 1 << 25)
-    return bool(mapped and library.mallopt(trim, (1 << 31) - 1) and library.mallopt(pad, 1 << 26))
+    kept = library and (library.mallopt(mapping, 1 << 30) or library.mallopt(mapping, 1 << 25))
+    return bool(kept and library.mallopt(trim, (1 << 31) - 1) and library.mallopt(pad, 1 << 26))
 
 
 def release() -> bool:
@@ -27,11 +26,10 @@ def release() -> bool:
 
     Else a long training's heap would grow without end: what stays settles where a large block was freed.
     """
-    library = _ours()
-    return library is not None and bool(library.malloc_trim(0))
+    return bool((library := _ours()) and library.malloc_trim(0))
 
 
-def _ours() -> ctypes.CDLL | None:
+def _ours() -> Any:
     """The C library, if it is glibc and nobody has said how it shall keep memory."""
     names = {f"MALLOC_{name}_" for name in ("TRIM_THRESHOLD", "TOP_PAD", "MMAP_THRESHOLD")}
     said = bool(names & os.environ.keys()) or os.environ.get("SYMPHONY_MALLOPT", "1") in {"", "0"}

@@ -39,7 +39,11 @@ def replacing(path: Path) -> Iterator[Path]:
         if place.exists() and not place.is_file():
             yield place
             return
-        _remove_drafts(place)
+        # Drafts of this file by processes that were killed go.
+        pattern = re.compile(rf"\.{re.escape(place.stem)}\.(\d+)\.new{re.escape(place.suffix)}")
+        for found in filter(None, map(pattern.fullmatch, os.listdir(place.parent))):
+            if not _lives(int(found[1])):
+                (place.parent / found[0]).unlink(missing_ok=True)
         draft = place.with_name(f".{place.stem}.{os.getpid()}.new{place.suffix}")
         try:
             yield draft
@@ -56,15 +60,12 @@ def _place(path: Path) -> Path:
     return place
 
 
-def _remove_drafts(place: Path) -> None:
-    """Remove drafts of this file by processes that were killed."""
-    pattern = re.compile(rf"\.{re.escape(place.stem)}\.(\d+)\.new{re.escape(place.suffix)}")
-    for found in filter(None, map(pattern.fullmatch, os.listdir(place.parent))):
-        try:
-            with suppress(PermissionError):  # somebody else's process lives
-                os.kill(int(found[1]), 0)
-        except (ProcessLookupError, OverflowError):
-            (place.parent / found[0]).unlink(missing_ok=True)
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError, PermissionError) as error:
+        return isinstance(error, PermissionError)  # somebody else's
+    return True
 
 
 def write_file(path: Path, text: str) -> None:
@@ -100,28 +101,24 @@ class Lock(AbstractContextManager["Lock"]):
 
     def __init__(self, path: Path, output: Path | None = None) -> None:
         self.path, self.output = path, output or path.parent
+        program = Path(sys.argv[0]).name.replace("__main__.py", "symphony")
+        who = f"{os.getpid()} on {socket.gethostname()}: {' '.join([program, *sys.argv[1:2]])}"
         with naming(path):
-            self._file = self._taken()
-            os.ftruncate(self._file, 0)
-            program = Path(sys.argv[0]).name.replace("__main__.py", "symphony")
-            who = f"{os.getpid()} on {socket.gethostname()}: {' '.join([program, *sys.argv[1:2]])}"
-            os.pwrite(self._file, who.encode(errors="replace"), 0)
-        self.close = weakref.finalize(self, _release, path, self._file, os.getpid())
+            while not _is_at(file := self._taken(), path):  # who had it has removed it meanwhile
+                os.close(file)
+            os.ftruncate(file, 0)
+            os.pwrite(file, who.encode(errors="replace"), 0)
+        self._file, self.close = file, weakref.finalize(self, _release, path, file, os.getpid())
 
     def _taken(self) -> int:
-        while True:
-            file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                who = os.pread(file, 500, 0).decode(errors="replace")
-                os.close(file)
-                if not isinstance(error, BlockingIOError):
-                    raise
-                raise DataError(f"is being written by another process: {who}", file=self.output) from error
-            if _is_at(file, self.path):
-                return file
-            os.close(file)  # who had it has removed it meanwhile
+        file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            who = os.pread(file, 500, 0).decode(errors="replace")
+            os.close(file)
+            raise DataError(f"is being written by another process: {who}", file=self.output) from error
+        return file
 
     def check(self) -> None:
         """Raise a :class:`DataError` if the folder was removed: another process may be writing a new one there."""
@@ -151,5 +148,6 @@ def lock_file(path: Path) -> AbstractContextManager[object]:
         place = _place(path)
     if place.is_dir():
         raise DataError("is a folder; name a file", file=path)
-    ordinary = place.is_file() or not place.exists()
-    return Lock(place.with_name(f".{place.name}.lock"), path) if ordinary else nullcontext()
+    if place.exists() and not place.is_file():
+        return nullcontext()
+    return Lock(place.with_name(f".{place.name}.lock"), path)

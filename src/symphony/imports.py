@@ -53,10 +53,10 @@ def _file(name: str) -> Any:
     path = Path(name).resolve()
     if str(path) in sys.modules:
         return sys.modules[str(path)]
-    spec = spec_from_file_location(str(path), path)
-    if not path.is_file() or spec is None or spec.loader is None:
+    if not path.is_file():
         raise ImportError(f"{path}: no such file")
     sys.path += [str(path.parent)] if str(path.parent) not in sys.path else []
+    spec: Any = spec_from_file_location(str(path), path)
     module = sys.modules[str(path)] = module_from_spec(spec)
     try:
         spec.loader.exec_module(module)

@@ -1,4 +1,4 @@
-"""TensorDict keys, defined once. Losses and modules take them as ``NestedKey`` arguments with these defaults.
+"""TensorDict keys, defined once; losses and modules take them as ``NestedKey`` arguments with these defaults.
 
 Shapes: ``...`` batch (scenes, branches), N interactive agents, O objects, P points, G routes, T steps.
 """

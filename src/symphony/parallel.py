@@ -36,11 +36,9 @@ class WorkerError(SymphonyError):
     """A worker process ended before its task was done: one of ``tasks``, numbers from 0 of those under way."""
 
     def __init__(self, tasks: list[int]) -> None:
+        why = "killed (out of memory?), crashed, or started in a script without `if __name__ == '__main__':`"
+        super().__init__(f"a worker process ended before its task was done: {why}")
         self.tasks = tasks
-        super().__init__(
-            "a worker process ended before its task was done: killed (out of memory?), crashed, or started "
-            "from a script without `if __name__ == '__main__':`"
-        )
 
 
 def ordered_map(
@@ -129,19 +127,18 @@ def _local_map(function: Callable[[T], R], tasks: Iterator[T], workers: int, nam
 
 
 def _begin_worker(lifeline: Connection, environment: dict[str, str]) -> None:
-    """End at once, whatever the task, when the parent closes its end of the pipe or ends, in whatever way."""
     os.environ.update(environment)
+    threading.Thread(target=_watch, args=(lifeline,), daemon=True).start()
 
-    def watch() -> None:
-        with contextlib.suppress(EOFError, OSError):
-            lifeline.recv_bytes()
-        os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
+def _watch(lifeline: Connection) -> None:
+    """End at once, whatever the task, when the parent closes its end of the pipe or ends, in whatever way."""
+    with contextlib.suppress(EOFError, OSError):
+        lifeline.recv_bytes()
+    os._exit(1)
 
 
 def _ray(workers: int) -> Any:
-    """Ray, connected."""
     address = os.environ.get("RAY_ADDRESS")
     size: dict[str, Any] = {} if address else {"num_cpus": workers, "include_dashboard": False}
     try:

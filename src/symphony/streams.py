@@ -1,7 +1,4 @@
-"""Random numbers as a function of (seed, stream, step).
-
-A number is a hash of what it is for, so that a rollout is the same in any batch, branch layout, process or device.
-"""
+"""Random numbers: hashes of what they are for, so that a rollout is the same in any batch, process or device."""
 
 from __future__ import annotations
 
@@ -37,16 +34,12 @@ def _signed(value: int) -> int:
     return (value + (1 << 63)) % (1 << 64) - (1 << 63)
 
 
-def _shift_xor(x: Int[Tensor, "*b"], bits: int) -> Int[Tensor, "*b"]:
-    # int64 shifts copy the sign; the mask makes the shift logical.
-    return x ^ ((x >> bits) & ((1 << (64 - bits)) - 1))
-
-
 def _mix(x: Int[Tensor, "*b"]) -> Int[Tensor, "*b"]:
     """SplitMix64's finaliser, a bijection of int64 in which each input bit sways each output bit."""
-    x = _shift_xor(x, 30) * _signed(0xBF58476D1CE4E5B9)
-    x = _shift_xor(x, 27) * _signed(0x94D049BB133111EB)
-    return _shift_xor(x, 31)
+    for bits, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        # int64 shifts copy the sign; the mask makes the shift logical.
+        x = (x ^ ((x >> bits) & ((1 << (64 - bits)) - 1))) * _signed(factor)
+    return x ^ ((x >> 31) & ((1 << 33) - 1))
 
 
 def fold_in(stream: Int[Tensor, "*#b"], index: Int[Tensor, "*#b"] | int) -> Int[Tensor, "*b"]:
@@ -64,10 +57,8 @@ def stream_of(text: str) -> int:
 def uniform(seed: int, stream: Int[Tensor, "*#b"], step: Int[Tensor, "*#b"] | int) -> Float[Tensor, "*b"]:
     """Draw uniform float32 numbers in the open interval (0, 1), with the same bits on every device.
 
-    Args:
-        seed: of the whole run.
-        stream: int64, one per independent sequence, e.g. made by :func:`fold_in` from segment, branch, agent.
-        step: int64 or int, counter within a sequence; broadcast against `stream`.
+    Takes the seed of the whole run, int64 streams, one for each independent sequence (made by :func:`fold_in` from
+    segment, branch, agent), and counters within a sequence, which are broadcast against the streams.
     """
     if stream.dtype != torch.int64:
         raise ValueError(f"streams are int64, got {stream.dtype}")

@@ -29,7 +29,6 @@ MOVING = 3.0  # m/s above which speeds and headings are compared
 SPAN = 1.0  # seconds over which positions and velocities are compared: from step to step, positions jitter
 BESIDE = 2.5  # metres within which a moving vehicle should find a lane that runs its way, within 0.6 rad
 
-
 RANGES: dict[str, tuple[str, float, float, Any, str]] = {
     "dt": ("time step", 0.01, 1.0, np.median, "median time step in s"),
     "ego_from_origin": ("re-centred", 0, 1000, np.max, "metres from the origin to an ego's first position"),
@@ -95,10 +94,8 @@ def check_reader(reader: Reader, files: Iterable[str | Path]) -> Conformance:
 
     Besides the checks of :func:`check_segments`: ``errors`` (nothing but :class:`DataError` comes of reading, and
     it names the file), ``source`` (segments name format and file) and ``determinism`` (reading again, in another
-    order, gives equal content). Errors of single records are allowed and reported.
-
-    Raises:
-        ConformanceError: naming every check that failed.
+    order, gives equal content). Errors of single records are allowed and reported. A :class:`ConformanceError` names
+    every check that failed.
     """
     paths = [Path(file) for file in files]
     report = Conformance()
@@ -212,10 +209,8 @@ def _graph(s: RunSegment) -> dict[str, Any]:
     gap = np.hypot(*(points[offsets[after]] - points[offsets[before + 1] - 1]).T)
     pairs = [(a, b, 1.0) for a, b in road.left_neighbors] + [(a, b, -1.0) for a, b in road.right_neighbors]
     long = np.diff(offsets) > 1
-    found = np.array(
-        [_beside(road.lanes, *pair) for pair in pairs if long[pair[0]] and long[pair[1]]], np.bool_
-    )
-    found = found.reshape(-1, 2)
+    fine = (pair for pair in pairs if long[pair[0]] and long[pair[1]])
+    found = np.array([_beside(road.lanes, *pair) for pair in fine], np.bool_).reshape(-1, 2)
     return {
         "lane_gap": (gap > 3.0) | (before == after),
         "neighbor_side": found[:, 0],

@@ -36,6 +36,7 @@ from symphony.parallel import Engine, ordered_map
 
 JOB, STORE, PARTS, STALE = "job.json", "store", "parts", "stale"
 REASONS_SHOWN = 5  # by an error when nothing could be converted
+Told = Callable[[int, int], None]
 Progress = Callable[[int, int, Report], None]
 """Called with the files done, the files in all, and the report so far, after each record and file."""
 
@@ -71,25 +72,19 @@ def convert(
         rate: steps per second (paper: 5).
         interactive: interactive agents a segment must have at its first step (N_I).
         smooth: sigma in seconds of the smoothing of tracks before they are resampled; 0 for none.
-        exclude_overlaps: leave out segments in whose log boxes overlap (see :mod:`symphony.data.overlaps`); they
-            are counted either way.
+        exclude_overlaps: leave out segments in whose log boxes overlap (see :mod:`symphony.data.overlaps`).
         radius: metres around the ego's path that are kept, of map and agents; None for all.
         hold_lights: give lights the last state that the log knows (before the first: the first) where it knows none.
-        strict: skip a record of which something odd would be left out, such as an agent without a size (see
-            :mod:`symphony.data.odd`).
+        strict: skip a record of which something odd would be left out (see :mod:`symphony.data.odd`).
         reader_options: arguments of the reader.
-        workers: processes that convert files (see :func:`symphony.parallel.ordered_map`); the result does not
-            depend on it.
-        engine: where they are; with Ray on several machines, ``files`` and ``out`` must be on a file system that
-            all of them share.
+        workers: processes that convert files (see :func:`symphony.parallel.ordered_map`), for the same result.
+        engine: where they are; with Ray, all machines must share the file system of ``files`` and ``out``.
         progress: told how far it is.
 
-    Returns:
-        The report, which is kept with the store as well.
+    Returns the report, which is kept with the store as well.
 
     Raises:
-        ConfigError: an argument out of range, an unknown format or reader option, or another argument than an
-            unfinished conversion to the same place was begun with.
+        ConfigError: an argument that can't be, or is another than an unfinished conversion there was begun with.
         DataError: ``out`` exists already, or not one segment could be converted.
         SymphonyError: a worker process died; what is done stays, as after an interrupt.
     """
@@ -118,7 +113,9 @@ def convert(
     begun = read_job(folder)
     if begun is not None:
         job.check_same(begun, folder)
-    done = begun is not None and not (folder / STORE).exists() and _is_of(job, out)
+    # Whether its store is in its place already.
+    done = begun is not None and not (folder / STORE).exists() and (out / store_format.HEADER).is_file()
+    done = done and SegmentStore(out).report.get("settings") == job.settings
     if not done:
         _check_free(out, begun)
     folder.mkdir(parents=True, exist_ok=True)
@@ -130,11 +127,10 @@ def convert(
         if done:
             report = Report.from_json(SegmentStore(out).report)
         else:
-            recipe = Preparation(
-                reader, 1 / rate, smooth, interactive, exclude_overlaps, radius, hold_lights, strict
-            )
+            rules = exclude_overlaps, radius, hold_lights, strict
+            how = Preparation(reader, 1 / rate, smooth, interactive, *rules)
             try:
-                report = _collected(recipe, job, folder, workers, engine, progress)
+                report = _collected(how, job, folder, workers, engine, progress or (lambda *_: None))
             except (ConfigError, DataError):
                 if all(part.suffix for part in (folder / PARTS).iterdir()):  # none is complete
                     _remove(folder)
@@ -215,16 +211,9 @@ def _check_free(out: Path, begun: Job | None) -> None:
     if not (out / store_format.HEADER).is_file():
         message = "exists and is not a segment store: refusing to write there"
     elif begun is not None:
-        message = (
-            f"exists, and {folder_of(out)} holds an unfinished conversion to that name: delete one of them"
-        )
+        held = f"{folder_of(out)} holds an unfinished conversion to that name"
+        message = f"exists, and {held}: delete one of them"
     raise DataError(message, file=out)
-
-
-def _is_of(job: Job, out: Path) -> bool:
-    """Whether the store of a job is in its place already."""
-    there = (out / store_format.HEADER).is_file()
-    return there and SegmentStore(out).report.get("settings") == job.settings
 
 
 def _begin(job: Job, folder: Path) -> None:
@@ -239,16 +228,11 @@ def _begin(job: Job, folder: Path) -> None:
 
 
 def _collected(
-    recipe: Preparation, job: Job, folder: Path, workers: int, engine: Engine, progress: Progress | None
+    how: Preparation, job: Job, folder: Path, workers: int, engine: Engine, tell: Progress
 ) -> Report:
     """Make the parts that are missing, and copy what they hold, in their order, into one store."""
-    tasks = tasks_of(recipe, job.files, folder / PARTS)
+    tasks = tasks_of(how, job.files, folder / PARTS)
     report = Report(settings=dict(job.settings))
-
-    def tell() -> None:
-        if progress is not None:
-            progress(report.files, len(job.files), report)
-
     shutil.rmtree(folder / STORE, ignore_errors=True)
     for stale in (folder / PARTS).glob("*.*"):
         shutil.rmtree(stale, ignore_errors=True)
@@ -259,9 +243,9 @@ def _collected(
             for file, entries in zip(task.files, part.report["entries"], strict=True):
                 for entry in entries:
                     _take(entry, part, file, writer, report)
-                    tell()
+                    tell(report.files, len(job.files), report)
                 report.files += 1
-                tell()
+                tell(report.files, len(job.files), report)
         writer.write_report(report.to_json())
     return report
 
@@ -329,16 +313,12 @@ def info(path: str | Path) -> dict[str, Any]:
     }
 
 
-def merge(
-    paths: Sequence[Path], out: Path, progress: Callable[[int, int], None] | None = None
-) -> SegmentStore:
+def merge(paths: Sequence[Path], out: Path, progress: Told | None = None) -> SegmentStore:
     """Copy all segments of some stores, in their order, into a new one, which appears once it is complete.
 
-    Its report joins theirs. ``progress`` is told how many segments are done, of how many.
-
-    Raises:
-        DataError: ``out`` exists or is being made, a segment is in two stores, the generation of one is not
-            finished, or stores differ in their time step; names the store.
+    Its report joins theirs. ``progress`` is told how many segments are done, of how many. A :class:`DataError` names
+    the store if ``out`` exists or is being made, a segment is in two stores, the generation of one is not finished,
+    or stores differ in their time step.
     """
     if out.exists():
         raise DataError("exists already; choose another folder", file=out)

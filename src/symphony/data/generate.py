@@ -140,7 +140,6 @@ PRESETS: dict[str, Preset] = {
 }
 """The standard sets: towns with signals, all kinds of unsignalled control and roundabouts, 10 s, N_I = 2."""
 
-
 PER_NETWORK = 8  # segments taken from one network
 RECORDED = 90.0  # simulated seconds per network, for segments of 10 s
 STRAIGHT = 5.0  # how many times likelier routes go straight on than they take one of the turns
@@ -169,15 +168,15 @@ def harvest(task: Task) -> Harvest:
     rule = replace(crop_rule(task.kind, task.duration, task.interactive), turn_interest=TURN_INTEREST)
     recorded = max(RECORDED, 5 * task.duration)
     try:
-        run = generate_run(task.kind, task.seed, recorded, rule=rule, straight=STRAIGHT)
+        every, reasons = generate_run(task.kind, task.seed, recorded, rule=rule, straight=STRAIGHT)
     except DataError as error:
         return Harvest(task, [], seconds=sum(os.times()[:4]) - begin, error=error.message)
-    found = [exclusion(segment, task.interactive) for segment in run.segments]
-    run.reasons.update(f"{error.field}: excluded by the paper's limits" for _, error in filter(None, found))
-    good = [segment for segment, excluded in zip(run.segments, found, strict=True) if excluded is None]
+    found = [exclusion(segment, task.interactive) for segment in every]
+    reasons.update(f"{error.field}: excluded by the paper's limits" for _, error in filter(None, found))
+    good = [segment for segment, excluded in zip(every, found, strict=True) if excluded is None]
     taken = _spread(good, PER_NETWORK, np.random.default_rng(task.seed))
     taken = [segment.replace(group=task.name) for segment in taken]
-    return Harvest(task, taken, len(good), run.reasons, sum(os.times()[:4]) - begin)
+    return Harvest(task, taken, len(good), reasons, sum(os.times()[:4]) - begin)
 
 
 def _spread(segments: list[RunSegment], count: int, rng: np.random.Generator) -> list[RunSegment]:
@@ -187,9 +186,7 @@ def _spread(segments: list[RunSegment], count: int, rng: np.random.Generator) ->
         by_map.setdefault(id(segment.road), []).append(segment)
     groups = [[group[i] for i in rng.permutation(len(group))] for group in by_map.values()]
     first = rng.permutation(len(groups))
-    turns = [
-        (turn, first[k], segment) for k, group in enumerate(groups) for turn, segment in enumerate(group)
-    ]
+    turns = [(turn, first[k], each) for k, group in enumerate(groups) for turn, each in enumerate(group)]
     return [segment for *_, segment in sorted(turns, key=lambda entry: entry[:2])[:count]]
 
 

@@ -14,7 +14,7 @@ from symphony.data.segment import LaneType, RoadMap
 REACH, TURN = (
     1.5,
     np.deg2rad(30),
-)  # metres (heights count) and radians within which one lane goes on from another
+)  # metres, heights counted, and radians within which a lane goes on from another
 SAME = 0.1  # metres within which two places are one
 STEP = 1e-3  # metres below which two neighbouring points of a lane have no direction
 TAG = "joined_gaps"  # of a stored segment: how many links were added to its map

@@ -9,6 +9,7 @@ reaches have no level and see all others.
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -22,9 +23,7 @@ RISE = 1.5  # metres by which a surface may rise from one column to a neighbour,
 SPACING = 2.0  # metres between the points at which the lines of a map are looked at, at most
 NOWHERE = 99  # number of what is a level away from all lines at its place, as on a bridge the map lacks
 
-_NEAR = sorted(
-    ((x, y) for x in range(-2, 3) for y in range(-2, 3)), key=lambda way: way[0] ** 2 + way[1] ** 2
-)
+_NEAR = sorted(product(range(-2, 3), repeat=2), key=lambda way: way[0] ** 2 + way[1] ** 2)
 _WIDE = 1 << 20
 
 

@@ -51,14 +51,12 @@ def _pairs(segment: RunSegment, drivers: NDArray[np.int64]) -> NDArray[np.int64]
     return np.sort(np.stack([one[hit], other[hit]], axis=-1), axis=1)
 
 
-def box_depth(
-    way: Doubles, heading_a: Doubles, size_a: Doubles, heading_b: Doubles, size_b: Doubles
-) -> Doubles:
+def box_depth(way: Doubles, angle_a: Doubles, size_a: Doubles, angle_b: Doubles, size_b: Doubles) -> Doubles:
     """[N] metres by which two boxes are in each other, by the separating-axis test; 0 or less if they are not.
 
     Takes the way [N, 2] from the centre of one to that of the other, headings [N], lengths and widths [N, 2].
     """
-    boxes: Any = ((heading_a, size_a / 2), (heading_b, size_b / 2))
+    boxes: Any = ((angle_a, size_a / 2), (angle_b, size_b / 2))
     depth = np.full(len(way), np.inf)
     for owner, _ in boxes:
         for turn in (0.0, np.pi / 2):

@@ -79,13 +79,6 @@ class Preparation:
         return segment
 
 
-def tags_of(segment: RunSegment) -> dict[str, Any]:
-    """Return the tags of a segment: what is unusual, boxes that overlap, lanes that were joined."""
-    odd = {**segment.odd, **dict.fromkeys(oddities(segment), "")}
-    pairs = len(overlaps.overlapping(segment))
-    return {k: v for k, v in ((ODD, odd), (overlaps.TAG, pairs), (joins.TAG, segment.joined_gaps)) if v}
-
-
 @dataclass(frozen=True)
 class Task:
     """A part to make: how, from which files, and where it lies once it is complete."""
@@ -134,4 +127,6 @@ def _entry(outcome: RunSegment | Skip, writer: StoreWriter) -> Any:
     # Of a name that comes twice the first is kept; whoever takes them out of the part sees it twice.
     if writer.has(outcome.segment_id):
         return writer.index_of(outcome.segment_id)
-    return writer.append(outcome, tags=tags_of(outcome))
+    odd = {**outcome.odd, **dict.fromkeys(oddities(outcome), "")}
+    tags = {ODD: odd, overlaps.TAG: len(overlaps.overlapping(outcome)), joins.TAG: outcome.joined_gaps}
+    return writer.append(outcome, tags={name: value for name, value in tags.items() if value})

@@ -10,18 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data import segment as schema
 from symphony.data.odd import noted
-from symphony.data.segment import (
-    MAX_DT,
-    MIN_DT,
-    STATES,
-    Ints,
-    RunSegment,
-    SignalState,
-    check_counts,
-    validate,
-    wrap,
-)
+from symphony.data.segment import STATES, Bools, Ints, RunSegment, SignalState, validate, wrap
 from symphony.errors import ConfigError
 
 Doubles = NDArray[np.float64]
@@ -30,10 +21,7 @@ MAX_SIGMA = 10.0  # seconds of smoothing; a window that is much longer leaves no
 BLOCK = 1_000_000  # numbers that are held at a time
 EVEN = 0.1  # share of a time step by which a frame may come early or late without being moved
 MAX_GAP = 1.0  # seconds between two frames of a log that are filled in between; a longer gap stays open
-SLOW, FAST = (
-    1.0,
-    2.0,
-)  # m/s between which the heading goes over from the logged one to the direction of motion
+SLOW, FAST = 1.0, 2.0  # m/s between which the heading goes over from the logged one to that of the motion
 
 LOST = "frames lost in the recording, filled in between"
 UNEVEN = "frames at uneven times, brought to even ones"
@@ -47,14 +35,11 @@ def resample(segment: RunSegment, dt: float) -> RunSegment:
     computed; a light unknown at a picked step has the latest state known since the one before (some WOMD records
     have lights at a single step). Otherwise positions and velocities are interpolated linearly, and headings along
     the shorter arc, between two neighbouring valid steps; an agent is valid where both are. A light keeps the state
-    of the latest logged step, and ``current_step`` becomes the latest new step not after the old one.
-
-    Raises:
-        ConfigError: ``dt`` is not positive, or absurd.
-        DataError: too few or too many steps would remain, or the ego would be valid at none.
+    of the latest logged step, and ``current_step`` becomes the latest new step not after the old one. A
+    :class:`DataError` says if too few or too many steps would remain, or the ego would be valid at none.
     """
-    if not MIN_DT <= dt <= MAX_DT:
-        raise ConfigError(f"dt must be between {MIN_DT:g} and {MAX_DT:g} s, is {dt}")
+    if not schema.MIN_DT <= dt <= schema.MAX_DT:
+        raise ConfigError(f"dt must be between {schema.MIN_DT:g} and {schema.MAX_DT:g} s, is {dt}")
     ratio = dt / segment.dt
     every = round(ratio)
     if every >= 1 and abs(ratio - every) < 1e-6 * every:
@@ -89,7 +74,7 @@ def hold_lights(segment: RunSegment) -> RunSegment:
 def _interpolate(segment: RunSegment, ratio: float, dt: float) -> RunSegment:
     last = segment.num_steps - 1
     steps = int(np.floor(last / ratio + 1e-6)) + 1
-    check_counts(segment.num_agents, steps, "valid")
+    schema.check_counts(segment.num_agents, steps, "valid")
     where = np.arange(steps) * ratio
     before = np.minimum(np.floor(where + 1e-6).astype(np.int64), last)
     share = np.clip(where - before, 0, 1)
@@ -115,7 +100,7 @@ def evened(segment: RunSegment, times: Doubles) -> RunSegment:
     frames = np.flatnonzero(np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0)
     logged = times[frames]
     steps = int(np.floor((logged[-1] - logged[0]) / dt + EVEN)) + 1
-    check_counts(segment.num_agents, steps, "valid")
+    schema.check_counts(segment.num_agents, steps, "valid")
     where = logged[0] + dt * np.arange(steps)
     last = np.clip(np.searchsorted(logged, where + EVEN * dt, side="right") - 1, 0, None)
     near = where - logged[last] <= EVEN * dt
@@ -180,9 +165,7 @@ def smooth(segment: RunSegment, sigma: float) -> RunSegment:
     return segment.replace(**{name: _masked(array, valid) for name, array in states.items()})
 
 
-def local_line(
-    values: Doubles, valid: NDArray[np.bool_], dt: float, sigma: float
-) -> tuple[Doubles, Doubles, NDArray[np.bool_]]:
+def local_line(values: Doubles, valid: Bools, dt: float, sigma: float) -> tuple[Doubles, Doubles, Bools]:
     """(value, slope, where a line could be fitted) at each step, of values [A, T, D]; values elsewhere."""
     there = valid.astype(np.float64)
     # Offsets from the agent's mean keep the sums small, so that nothing is lost to cancellation.
@@ -215,7 +198,7 @@ def _moments(there: Doubles, masked: Doubles, rows: slice, dt: float, sigma: flo
     return *sums, *((weight * lag**k) @ masked for k in range(2))
 
 
-def _unwrapped(heading: Doubles, valid: NDArray[np.bool_]) -> Doubles:
+def _unwrapped(heading: Doubles, valid: Bools) -> Doubles:
     """[A, T] headings without jumps of 2π between an agent's successive valid steps."""
     result = heading.copy()
     for agent in np.flatnonzero(valid.any(axis=1)):
@@ -223,6 +206,6 @@ def _unwrapped(heading: Doubles, valid: NDArray[np.bool_]) -> Doubles:
     return result
 
 
-def _masked(array: Doubles, valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _masked(array: Doubles, valid: Bools) -> NDArray[np.float32]:
     mask = valid.reshape(*valid.shape, *[1] * (array.ndim - 2))
     return np.where(mask, array, 0).astype(np.float32)

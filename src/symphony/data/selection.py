@@ -17,9 +17,7 @@ Reals = NDArray[np.floating[Any]]
 Rows = NDArray[np.integer[Any]]
 
 HALF_LANE, APART = 1.5, 2.5  # metres aside within which paths are one, and from which on lanes are different
-SAME_WAY = np.deg2rad(
-    30
-)  # turn below which two at the same place go the same way; up to 150 degrees they cross
+SAME_WAY = np.deg2rad(30)  # turn below which two at one place go the same way; up to 150 degrees they cross
 SHARED, LOOKBACK = 5.0, 50.0  # metres of path in common, and of those compared before two paths become one
 TIME_GAP = 3.0  # seconds between two vehicles at the same place within which one follows the other
 CONFLICT_GAP = 4.0
@@ -266,9 +264,8 @@ def interactive_agents(segment: RunSegment, count: int) -> NDArray[np.int64]:
 def choices(segments: Iterable[RunSegment], count: int) -> dict[str, Any]:
     """The choices in many segments, as JSON can hold them.
 
-    Returns:
-        ``count``; ``contexts``: how many segments have a partner of each :class:`Context`; ``too_few``: how many
-        have fewer vehicles; ``segments``: by segment id the ``context`` and the ``agents`` (the source's ids).
+    That is ``count``; ``contexts``: how many segments have a partner of each :class:`Context`; ``too_few``: how many
+    have fewer vehicles; ``segments``: by segment id the ``context`` and the ``agents`` (the source's ids).
     """
     found: dict[str, dict[str, Any]] = {}
     too_few = 0
@@ -283,15 +280,11 @@ def choices(segments: Iterable[RunSegment], count: int) -> dict[str, Any]:
     return {"count": count, "contexts": contexts, "too_few": too_few, "segments": found}
 
 
-def _partner(
-    segment: RunSegment, others: NDArray[np.int64], moves: NDArray[np.int64]
-) -> tuple[int | None, Context | None]:
+def _partner(segment: RunSegment, others: Rows, moves: Rows) -> tuple[int | None, Context | None]:
     """The ego's partner among others and those of them that move, both in the order of preference."""
-    for group, marks, context in (
-        (others, segment.interest, Context.INTEREST),
-        (moves, segment.predict, Context.PREDICT),
-    ):
-        marked = group[np.isin(group, marks)]
+    marks = ((others, segment.interest, Context.INTEREST), (moves, segment.predict, Context.PREDICT))
+    for group, wanted, context in marks:
+        marked = group[np.isin(group, wanted)]
         if len(marked):
             return int(marked[0]), context
     if len(moves) == 0:

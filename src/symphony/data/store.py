@@ -16,16 +16,8 @@ from typing import Any, SupportsIndex, cast, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.segment import (
-    MAX_AGENTS,
-    MAX_POINTS,
-    MAX_STEPS,
-    Polylines,
-    RoadMap,
-    RunSegment,
-    content_hash,
-    validate,
-)
+from symphony.data import segment as schema
+from symphony.data.segment import Polylines, RoadMap, RunSegment, content_hash, validate
 from symphony.data.store_format import MAPS, REPORT, SEGMENTS, Table, check_header, read_json
 from symphony.errors import DataError
 
@@ -39,10 +31,8 @@ class SegmentStore(Sequence[RunSegment]):
 
     Holds what was complete when it was opened. Pickles as its path, so each process maps the files itself. The first
     time a process reads a segment, its content and its map's are compared with the hash that was written with it,
-    and checked against the schema.
-
-    Raises:
-        DataError: not a store, of another version, or a file is missing, truncated or damaged.
+    and checked against the schema. A :class:`DataError` says if it is no store, of another version, or a file is
+    missing, truncated or damaged.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -54,10 +44,8 @@ class SegmentStore(Sequence[RunSegment]):
         if self._map_columns(MAPS, self._maps) or more:
             counted = self.report.get("converted")
             if isinstance(counted, int) and counted > len(self):
-                message = (
-                    f"index holds {len(self)} segments, the report of their conversion {counted}: cut short"
-                )
-                raise DataError(message, file=SEGMENTS.index_path(self.path))
+                held = f"index holds {len(self)} segments, the report of their conversion {counted}"
+                raise DataError(f"{held}: cut short", file=SEGMENTS.index_path(self.path))
         self._unseen = np.ones(len(self), np.bool_)
 
     def _map_columns(self, table: Table, records: NDArray[Any]) -> bool:
@@ -321,7 +309,8 @@ def _read_indices(folder: Path) -> tuple[NDArray[Any], NDArray[Any]]:
     count, axes = segments["count"], SEGMENTS.axes
     agents, lights, steps = count[:, axes["agents"]], count[:, axes["signals"]], segments["steps"]
     # Limits first: a product of numbers out of range may wrap around to a right one.
-    sound = (steps >= 2) & (steps <= MAX_STEPS) & (agents <= MAX_AGENTS) & (lights <= MAX_POINTS)
+    sound = (steps >= 2) & (steps <= schema.MAX_STEPS)
+    sound &= (agents <= schema.MAX_AGENTS) & (lights <= schema.MAX_POINTS)
     sound &= count[:, axes["states"]] == agents * steps
     sound &= count[:, axes["signal_states"]] == lights * steps
     sound &= (segments["ego"] >= 0) & (segments["ego"] < agents) & (segments["map"] >= 0)

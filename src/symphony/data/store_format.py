@@ -68,9 +68,8 @@ class Table:
     def record(self) -> np.dtype[Any]:
         """Layout of one index record."""
         axes = (len(self.axes),)
-        return np.dtype(
-            [("begin", "<i8", axes), ("count", "<i8", axes), ("hash", "u1", (32,)), *self.scalars]
-        )
+        extents = ("begin", "<i8", axes), ("count", "<i8", axes)
+        return np.dtype([*extents, ("hash", "u1", (32,)), *self.scalars])
 
     def index_path(self, folder: Path) -> Path:
         """Return where the index lies."""
@@ -101,7 +100,7 @@ SEGMENTS = Table(
         *(Column(name, name, "|u1") for name in ("segment_id", "source", "file", "tags")),
     ),
     (
-        *((name, "<i8", ()) for name in ("map", "steps", "ego", "current_step")),
+        *((n, "<i8", ()) for n in ("map", "steps", "ego", "current_step")),
         ("dt", "<f8", ()),
         ("origin", "<f8", (3,)),
     ),

@@ -6,8 +6,8 @@ import json
 import operator
 import os
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -21,7 +21,7 @@ from symphony.errors import DataError
 from symphony.files import Lock, naming, write_json
 
 
-class StoreWriter:
+class StoreWriter(AbstractContextManager["StoreWriter"]):
     """Adds segments to a store, one at a time; each is on record once :meth:`append` returns.
 
     Its folder is created, or must be empty unless an existing store is continued (``append``): then what a writer
@@ -129,12 +129,7 @@ class StoreWriter:
             self._lock.close()
             self._lock = None
 
-    def __enter__(self) -> StoreWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 

@@ -27,17 +27,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.segment import (
-    MAX_POINTS,
-    MAX_STEPS,
-    AgentType,
-    Bools,
-    LaneType,
-    MarkType,
-    RoadMap,
-    RunSegment,
-    check_counts,
-)
+from symphony.data import segment as schema
+from symphony.data.segment import MAX_STEPS, AgentType, Bools, LaneType, MarkType, RoadMap, RunSegment
 from symphony.data.sources import lines
 from symphony.data.sources.base import Doubles, Item, Reader, T, located, motion, read_whole, readable, refuse
 from symphony.data.sources.lines import Lane
@@ -121,18 +112,18 @@ def map_path(path: Path) -> Path:
 def read_columns(data: bytes) -> Columns:
     """Return the columns the reader needs, as arrays [N].
 
-    Raises:
-        DataError: the file is no Parquet, too large, a column is missing, of another type, or has gaps.
+    A :class:`DataError` says if the file is no Parquet or too large, or a column is missing, of another type, or has
+    gaps.
     """
     import pyarrow as pa  # noqa: PLC0415 - an optional extra
     from pyarrow import parquet  # noqa: PLC0415
 
     try:
-        schema = parquet.read_schema(pa.BufferReader(data))
+        head = parquet.read_schema(pa.BufferReader(data))
         for name, kind in _COLUMNS.items():
-            refuse(name not in schema.names, "the column is missing", name)
-            if pa.types.is_nested(schema.field(name).type):
-                raise DataError(f"expected {kind}, is {schema.field(name).type}", field=name)
+            refuse(name not in head.names, "the column is missing", name)
+            found = head.field(name).type
+            refuse(pa.types.is_nested(found), f"expected {kind}, is {found}", name)
         # Text stays a dictionary: a long one that all rows share must not become a copy for each.
         source = pa.BufferReader(data)
         file = parquet.ParquetFile(source, read_dictionary=list(_TEXTS), page_checksum_verification=True)
@@ -161,8 +152,8 @@ def _check_size(file: Any) -> None:
 
 
 def _column(pa: Any, column: Any, name: str) -> NDArray[Any]:
-    if column.null_count or not len(column):
-        raise DataError(f"{column.null_count} of {len(column)} values are missing", field=name)
+    missing = column.null_count
+    refuse(missing or not len(column), f"{missing} of {len(column)} values are missing", name)
     try:
         # What Arrow would convert, such as a text to a number or a number to a text, is another column.
         kind, of = getattr(column.type, "value_type", column.type), pa.types
@@ -201,7 +192,7 @@ def _segment(columns: Columns, name: str, path: Path) -> RunSegment:
     refuse(not 2 <= count <= MAX_STEPS, f"{count} steps, expected 2 … {MAX_STEPS}", "num_timestamps")
     refuse(step.min() < 0 or step.max() >= count, f"a step that is none of the {count}", "timestep")
     steps = int(step.max()) + 1
-    check_counts(len(names), steps, "track_id")
+    schema.check_counts(len(names), steps, "track_id")
     states, counts = np.unique(row * steps + step, return_counts=True)
     twice = [f"{names[order][k // steps]} at step {k % steps}" for k in states[counts > 1].tolist()]
     refuse(twice, f"two states of track {twice[:1]}", "timestep")
@@ -280,7 +271,7 @@ def _road(root: Any, origin: Doubles) -> tuple[RoadMap, dict[str, str]]:
     points = 0
     for lane, marked in each("lane_segments", _lane, NO_LANE):
         points += len(lane.line)
-        refuse(points > MAX_POINTS, f"more than {MAX_POINTS} points", "lane_segments")
+        refuse(points > schema.MAX_POINTS, f"more than {schema.MAX_POINTS} points", "lane_segments")
         if len(lane.line):
             lanes.setdefault(lane.name, lane)
             bounds += marked
@@ -315,10 +306,8 @@ def _lane(node: dict[str, Any]) -> tuple[Lane, list[Doubles]]:
     beside = [[node[f"{side}_neighbor_id"]] for side in ("left", "right")]
     refs = [node["successors"], node["predecessors"], *(found if found != [None] else [] for found in beside)]
     links = [[_id(ref) for ref in found] for found in refs]
-    marks = [node[f"{side}_lane_mark_type"] for side in ("left", "right")]
-    marked = [
-        line for line, mark in zip((left, right), marks, strict=True) if mark not in ("NONE", "UNKNOWN")
-    ]
+    marks = [node[f"{side}_lane_mark_type"] not in ("NONE", "UNKNOWN") for side in ("left", "right")]
+    marked = [line for line, mark in zip((left, right), marks, strict=True) if mark]
     return Lane(_id(node["id"]), center, _LANE_TYPES[node["lane_type"]], width, np.nan, *links), marked
 
 

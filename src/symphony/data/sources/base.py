@@ -20,11 +20,11 @@ from symphony.errors import ConfigError, DataError
 
 T = TypeVar("T")
 Doubles = NDArray[np.float64]
+Odd = dict[str, str]  # what was left out, or is unusual: kind -> example
 Item = RunSegment | DataError  # one record of a file: a valid run segment, or why there is none
 MAX_NUMBER = 1e8  # larger magnitudes are no metres, seconds or radians of a road
 NEAR = 50.0  # metres within which another agent counts as a neighbour of an ego candidate
 MOVING = 2.0  # metres an agent must get away from where it is first seen to count as moving
-
 
 MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 """What plain code raises on data that are built otherwise than it expects."""
@@ -55,10 +55,9 @@ class Reader(ABC):
         """
         path = Path(path)
         try:
-            if path.is_dir():
-                raise DataError("is a folder, expected a file", file=path)
-            if path.exists() and not path.is_file():
-                raise DataError("is no ordinary file", file=path)  # a pipe may never end
+            refuse(path.is_dir(), "is a folder, expected a file", file=path)
+            # A pipe may never end.
+            refuse(path.exists() and not path.is_file(), "is no ordinary file", file=path)
             items = iter(self._read(path))
             while True:
                 # Absurd numbers may overflow on the way: the result is not finite, which validation reports.
@@ -144,11 +143,9 @@ def unexpected(error: Exception, *, file: object = None, segment: str | None = N
 def read_whole(path: Path, most: int | None = None) -> bytes:
     """Return the content of a file; a :class:`DataError` if it is empty or has more than ``most`` bytes."""
     size, most = path.stat().st_size, MAX_FILE if most is None else most
-    if size > most:
-        raise DataError(f"{size} bytes, at most {most}: too large for a file of this format", file=path)
+    refuse(size > most, f"{size} bytes, at most {most}: too large for a file of this format", file=path)
     data = path.read_bytes()
-    if not data.strip():
-        raise DataError("the file is empty", file=path)
+    refuse(not data.strip(), "the file is empty", file=path)
     return data
 
 
@@ -203,11 +200,7 @@ def to_float32(array: NDArray[np.float64]) -> Floats:
 def motion(position: Doubles, heading: Doubles, velocity: Doubles, valid: Bools) -> dict[str, Any]:
     """Return the fields of a run segment for states; what is not valid becomes 0, and so does an unknown height.
 
-    Args:
-        position: [A, T, 2 or 3], re-centred.
-        heading: [A, T].
-        velocity: [A, T, 2].
-        valid: [A, T].
+    Takes re-centred positions [A, T, 2 or 3], headings [A, T], velocities [A, T, 2] and what is valid [A, T].
     """
     place = np.pad(position, ((0, 0), (0, 0), (0, 3 - position.shape[-1])))
     return {
@@ -255,14 +248,8 @@ def busiest_first(
 ) -> NDArray[np.int64]:
     """Return the rows of the vehicles that move and are valid at every step, the one to be the ego first.
 
-    That is the one with the most moving neighbours, summed over the steps; then the lowest id.
-
-    Args:
-        agent_id: [A].
-        agent_type: [A].
-        position: [A, T, 2] metres.
-        valid: [A, T].
-        dynamic: [A] which may be egos; by default all.
+    That is the one with the most moving neighbours, summed over the steps; then the lowest id. Positions [A, T, 2]
+    are metres, and ``dynamic`` [A] says which may be egos; by default all.
     """
     # Not the length of the path: the jitter of a parked car's track would add up.
     start = position[np.arange(len(position)), valid.argmax(1), None]

@@ -28,19 +28,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.segment import (
-    AgentType,
-    Bools,
-    LaneType,
-    MarkType,
-    RunSegment,
-    SignalState,
-    check_counts,
-    check_signals,
-)
+from symphony.data import segment as schema
+from symphony.data.segment import AgentType, Bools, LaneType, MarkType, RunSegment, SignalState
 from symphony.data.sources import base, lines
-from symphony.data.sources.base import Doubles, Item, Reader, by_ego, located, motion, readable, refuse
-from symphony.data.sources.lines import Lane
+from symphony.data.sources.base import Doubles, Item, Odd, Reader, by_ego, located, motion, readable, refuse
+from symphony.data.sources.lines import Codes, Lane, Lights
 from symphony.errors import DataError
 
 VERSIONS = ("2018b", "2020a")
@@ -129,9 +121,7 @@ class CommonRoadReader(Reader):
         yield from by_ego(segment, candidates, self.egos)
 
 
-def _tracks(
-    root: ET.Element, dt: float, odd: dict[str, str]
-) -> tuple[dict[str, Any], Doubles, Bools, Bools, int]:
+def _tracks(root: ET.Element, dt: float, odd: Odd) -> tuple[dict[str, Any], Doubles, Bools, Bools, int]:
     """Return all obstacles of either version, over the steps any dynamic one is present at.
 
     Gives ids, types and sizes, states [A, T, 6] (see :func:`_state`, with a velocity in place of speeds), where they
@@ -142,14 +132,13 @@ def _tracks(
     nodes += [(node, _text(node, "role") == "dynamic") for node in root.findall("obstacle")]
     nodes = [(node, moves) for node, moves in nodes if moves or _text(node, "type") not in _SCENERY]
     nodes.sort(key=lambda entry: not entry[1])
-    found = [
-        (*each, moves) for node, moves in nodes for each in readable(NO_OBSTACLE, odd, _obstacle, node, moves)
-    ]
+    read = [(readable(NO_OBSTACLE, odd, _obstacle, node, moves), moves) for node, moves in nodes]
+    found = [(*each, moves) for some, moves in read for each in some]
     logs = [log for _, _, log, _, moves in found if moves]
     refuse(not logs, odd.get(NO_OBSTACLE, "has no dynamic obstacles"), "dynamicObstacle")
     first = min(int(log[:, 0].min()) for log in logs)
     steps = max(int(log[:, 0].max()) for log in logs) - first + 1
-    check_counts(len(found), steps, "time")
+    schema.check_counts(len(found), steps, "time")
     table, valid = np.full((len(found), steps, 6), np.nan), np.zeros((len(found), steps), np.bool_)
     size = np.zeros((len(found), 3))
     for row, (_, _, log, (sides, offset, turn), moves) in enumerate(found):
@@ -283,7 +272,7 @@ class _Lanelet:
         return np.concatenate([self.left, self.right[::-1], self.left[:1]])
 
 
-def _map(root: ET.Element, steps: NDArray[np.int64], origin: Doubles, odd: dict[str, str]) -> dict[str, Any]:
+def _map(root: ET.Element, steps: NDArray[np.int64], origin: Doubles, odd: Odd) -> dict[str, Any]:
     """Return map and lights of either version as fields of a run segment, whose time steps [T] are given."""
     limits: dict[int, float] = {}
     for node in root.findall("trafficSign"):
@@ -313,9 +302,8 @@ def _speed_limits(sign: ET.Element) -> dict[int, float]:
     for element in sign.findall("trafficSignElement"):
         value = element.findtext("additionalValue")
         if _text(element, "trafficSignID") in _SPEED_SIGNS and value is not None:
-            limits[base.integer(sign.get("id"), "trafficSign id")] = base.number(
-                value, "trafficSign additionalValue"
-            )
+            sign_id = base.integer(sign.get("id"), "trafficSign id")
+            limits[sign_id] = base.number(value, "trafficSign additionalValue")
     return limits
 
 
@@ -352,22 +340,20 @@ def _lane_type(kinds: Set[str]) -> LaneType:
     return next((lane_type for lane_type, names in _LANE_TYPES if kinds & names), LaneType.UNDEFINED)
 
 
-def _signals(
-    root: ET.Element, ways: Sequence[_Lanelet], steps: NDArray[np.int64], odd: dict[str, str]
-) -> dict[int, tuple[Doubles, NDArray[np.uint8]]]:
+def _signals(root: ET.Element, ways: Sequence[_Lanelet], steps: NDArray[np.int64], odd: Odd) -> Lights:
     """Return lane -> (stop point [2], state [T]) of the traffic lights."""
     turns: dict[int, str] = {}
     for incoming in root.findall("intersection/incoming"):
         for side in ("Left", "Straight", "Right"):
             turns |= dict.fromkeys(_references(incoming, f"successors{side}", "intersection"), side.lower())
     index = {way.lane.name: k for k, way in enumerate(ways)}
-    known: dict[int, tuple[str, NDArray[np.uint8]]] = {}
+    known: dict[int, tuple[str, Codes]] = {}
     wanted = {ref for way in ways for ref in way.lights}
     for node in root.findall("trafficLight"):
         for name, direction, states in readable(NO_LIGHT, odd, _light, node, steps, wanted):
             known[name] = direction, states
-            check_signals(len(known), len(steps), "trafficLight")
-    found: dict[int, tuple[Doubles, NDArray[np.uint8]]] = {}
+            schema.check_signals(len(known), len(steps), "trafficLight")
+    found: Lights = {}
     for k, way in enumerate(ways):
         after = [index[ref] for ref in way.lane.successors if ref in index]
         for direction, states in (known[ref] for ref in way.lights if ref in known):
@@ -375,13 +361,11 @@ def _signals(
                 turn = turns.get(ways[target].lane.name)
                 if direction == "all" or turn is None or turn in direction:
                     found.setdefault(target, (way.stop, states))
-        check_signals(len(found), len(steps), "trafficLight")
+        schema.check_signals(len(found), len(steps), "trafficLight")
     return found
 
 
-def _light(
-    node: ET.Element, steps: NDArray[np.int64], wanted: set[int]
-) -> tuple[int, str, NDArray[np.uint8]] | None:
+def _light(node: ET.Element, steps: NDArray[np.int64], wanted: set[int]) -> tuple[int, str, Codes] | None:
     """Return (id, direction, state at each time step) of a light that some lanelet refers to.
 
     Its cycle repeats, its first element beginning at the time offset.

@@ -67,7 +67,8 @@ _PHASE_COLUMNS = ("signal_group_id", "timestamp_ms", "movement_state")
 _NUMBERED = re.compile(r"vehicle_tracks_(\w+)\.csv")
 _SPLIT = re.compile(r"(\w.*)_(train|val)\.csv")
 
-Lights = dict[int, tuple[Doubles, NDArray[np.int64], NDArray[np.uint8]]]
+Times = NDArray[np.int64]  # milliseconds
+Lights = dict[int, tuple[Doubles, Times, lines.Codes]]
 """Lane -> (its stop point [2] in metres, milliseconds [N] from which a state holds, that state [N])."""
 
 
@@ -314,9 +315,7 @@ def _read_meta(path: Path, part: str) -> tuple[Doubles, bool]:
         return origin, spat == "yes"
 
 
-def _states_at(
-    since: NDArray[np.int64], states: NDArray[np.uint8], times: NDArray[np.int64]
-) -> NDArray[np.uint8]:
+def _states_at(since: Times, states: lines.Codes, times: Times) -> lines.Codes:
     """Return [T] states of a light at times in milliseconds: the latest known, UNKNOWN before the first."""
     last = np.searchsorted(since, times, side="right") - 1
     return np.where(last >= 0, states[last], SignalState.UNKNOWN).astype(np.uint8)
@@ -332,9 +331,7 @@ def _read_lights(
     connections = [each for each in _read_connections(topology, projection) if each.group in groups]
     found: Lights = {}
     for lane, line in lanes.items():
-        misses = [
-            (np.hypot(*(line[0] - each.start)), np.hypot(*(line[-1] - each.end))) for each in connections
-        ]
+        misses = [(np.hypot(*(line[0] - one.start)), np.hypot(*(line[-1] - one.end))) for one in connections]
         near = [(a + b, k) for k, (a, b) in enumerate(misses) if a <= START and b <= END]
         if near:
             best = connections[min(near)[1]]

@@ -62,9 +62,8 @@ class Rows:
 def read_rows(path: Path) -> Rows:
     """Read a track file.
 
-    Raises:
-        DataError: too large, empty, cut short, a column is missing, or a field can't be read; names file and line.
-        OSError: the file can't be read.
+    A :class:`DataError` names file and line where it is too large, empty or cut short, or a column is missing, or a
+    field can't be read.
     """
     size = path.stat().st_size
     refuse(size > MAX_BYTES, f"{size} bytes, at most {MAX_BYTES} can be read", file=path)
@@ -180,15 +179,8 @@ def stepped(rows: Rows) -> tuple[Rows, float, float]:
 def check_motion(rows: Rows, dt: float, start: float) -> None:
     """Refuse rows whose velocities and headings of vehicles that move are not those of their positions.
 
-    Compared over a second: medians over all vehicles, so that single wild tracks do not count.
-
-    Args:
-        rows: those of :func:`stepped`.
-        dt: seconds per step.
-        start: milliseconds at step 0.
-
-    Raises:
-        DataError: they are not, or a track has two states at one time.
+    Compared over a second: medians over all vehicles, so that single wild tracks do not count. Takes what
+    :func:`stepped` gives. A :class:`DataError` says, too, if a track has two states at one time.
     """
     twice = _twice(rows)
     if len(twice):
@@ -234,12 +226,8 @@ def merged(rows: Rows) -> Rows:
 
 
 def resolved(rows: Rows, dt: float, *, by_positions: bool) -> Rows:
-    """Return rows in which ``pedestrian/bicycle`` are pedestrians or, if fast (:data:`CYCLING`), cyclists.
-
-    Args:
-        rows: those of :func:`stepped`.
-        dt: seconds per step.
-        by_positions: take speeds from the positions, not from the velocities.
+    """Return rows of :func:`stepped` in which ``pedestrian/bicycle`` are pedestrians or, if fast (:data:`CYCLING`),
+    cyclists; speeds are those of the positions if ``by_positions``, else of the logged velocities.
     """
     kind = rows.kind.copy()
     unknown = np.flatnonzero(kind == AgentType.UNSET)

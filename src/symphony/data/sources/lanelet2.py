@@ -119,15 +119,10 @@ class LaneletMap:
 
 
 def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
-    """Read an ``.osm`` or ``.osm_xy`` file.
+    """Read an ``.osm`` or ``.osm_xy`` file; ``projection``, such as ``partial(utm, origin=...)``, is for degrees.
 
-    Args:
-        path: the file.
-        projection: for files without metres, such as ``partial(utm, origin=...)``.
-
-    Raises:
-        DataError: it is no OSM XML, declares a document type, a node, way or rule can't be read, or it has no
-            lanelets with both bounds; names the file and the element.
+    A :class:`DataError` names file and element where it is no OSM XML, declares a document type, a node, way or rule
+    can't be read, or it has no lanelets with both bounds.
     """
     with located(file=path):
         root = base.load_xml(path, "OSM")
@@ -428,7 +423,6 @@ def _degrees(places: Doubles, origin: Doubles) -> Doubles:
     """Return [N + 1, 2] degrees, the origin last."""
     both = np.concatenate([places.reshape(-1, 2), origin[None]])
     if not (np.abs(both) <= (MAX_LATITUDE, 180)).all():  # comparisons with NaN are false
-        raise DataError(
-            f"a place outside latitudes ±{MAX_LATITUDE:g} and longitudes ±180 degrees", field="lat, lon"
-        )
+        message = f"a place outside latitudes ±{MAX_LATITUDE:g} and longitudes ±180 degrees"
+        raise DataError(message, field="lat, lon")
     return both

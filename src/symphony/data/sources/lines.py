@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,9 @@ from symphony.data.sources.base import Doubles, pairs, refuse, to_float32
 from symphony.errors import DataError
 
 Links = NDArray[np.int32]  # [E, 2] lane indices (from, to)
+Codes = NDArray[np.uint8]  # members of an enumeration of the schema
+Mark = tuple[Doubles, MarkType]  # its points, and what it is
+Lights = dict[int, tuple[Doubles, Any]]  # lane -> (stop point [2 or 3], states [T])
 MAX_EDGES, MAX_NEAR, MAX_CROSSINGS, MAX_KNOTS = 500_000, 2_000_000, 50_000, 500
 """Edges of outlines, pairs of them whose boxes overlap, pairs that cross, and pairs of one outline that do: the time
 and memory of a union grow with them, with the last by a power. Maps of 7 000 edges had 1 500 crossings."""
@@ -57,7 +60,7 @@ def road_map(
     lanes: Sequence[Lane],
     origin: Doubles,
     boundary: Sequence[Doubles],
-    marks: Sequence[tuple[Doubles, MarkType]],
+    marks: Sequence[Mark],
     *,
     links: Links | None = None,
     beside: tuple[Links, Links] | None = None,
@@ -65,14 +68,8 @@ def road_map(
 ) -> RoadMap:
     """Return the map relative to an origin [2 or 3]; z is 0 where lines have none.
 
-    Args:
-        lanes: the lanes.
-        origin: what is subtracted.
-        boundary: lines with the drivable side on their left.
-        marks: other lines, each with what it is.
-        links: successors; by default what the lanes say.
-        beside: left and right neighbours; by default what the lanes say.
-        ids: numbers of the lanes; by default their names, which are numbers.
+    The boundary's lines have the drivable side on their left. By default ``links`` (successors) and ``beside`` (left
+    and right neighbours) are what the lanes say, and ``ids`` their names, which are numbers.
     """
 
     def local(lines: Iterable[Doubles]) -> Polylines:
@@ -95,8 +92,8 @@ def road_map(
     )
 
 
-def lights(found: Mapping[int, tuple[Doubles, Any]], steps: int, origin: Doubles) -> dict[str, Any]:
-    """Return the fields of a run segment for lights: lane -> (stop point [2 or 3], states [T])."""
+def lights(found: Lights, steps: int, origin: Doubles) -> dict[str, Any]:
+    """Return the fields of a run segment for lights."""
     points = np.array([point - origin for point, _ in found.values()]).reshape(-1, len(origin))
     return {
         "signal_lane": np.array(list(found), np.int32),
@@ -105,7 +102,7 @@ def lights(found: Mapping[int, tuple[Doubles, Any]], steps: int, origin: Doubles
     }
 
 
-def painted(bounds: Iterable[Doubles]) -> list[tuple[Doubles, MarkType]]:
+def painted(bounds: Iterable[Doubles]) -> list[Mark]:
     """Return painted bounds of lanes as marks; one that two lanes share, in either direction, counts once."""
     found: dict[bytes, Doubles] = {}
     for bound in bounds:
@@ -134,13 +131,11 @@ def median_width(left: Doubles, right: Doubles) -> float:
     return float(np.median(np.hypot(*(left - right).T)))
 
 
-def drivable_rings(
-    outlines: Sequence[Doubles | shapely.Polygon], field: str = "lanelet"
-) -> tuple[Doubles, ...]:
+def drivable_rings(outlines: Sequence[Any], field: str = "lanelet") -> tuple[Doubles, ...]:
     """Return closed rings [P, 2] around the union of outlines, inside on the left; holes run the other way.
 
-    Slits and holes up to 2 * :data:`SLIT` wide are closed. A :class:`DataError` says of which ``field`` the union
-    can't be formed, or would be beyond all measure.
+    Outlines are points [P, 2] or polygons. Slits and holes up to 2 * :data:`SLIT` wide are closed. A
+    :class:`DataError` says of which ``field`` the union can't be formed, or would be beyond all measure.
     """
     shapes = [outline for outline in outlines if isinstance(outline, shapely.Polygon)]
     flat = [outline[:, :2] for outline in outlines if not isinstance(outline, shapely.Polygon)]
@@ -148,10 +143,8 @@ def drivable_rings(
     try:
         # Shapely takes NaN and infinity on its way through outlines of no width for something to warn of.
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            union = shapely.union_all(
-                shapely.make_valid(np.array([shapely.Polygon(each) for each in outlines], object))
-            )
-            wider = union.buffer(SLIT, join_style="mitre")
+            areas = np.array([shapely.Polygon(each) for each in outlines], object)
+            wider = shapely.union_all(shapely.make_valid(areas)).buffer(SLIT, join_style="mitre")
             closed = wider.buffer(-SLIT, join_style="mitre").simplify(0.01)
     except (shapely.errors.ShapelyError, ValueError) as error:
         raise DataError(f"the union of the areas can't be formed: {error}", field=field) from error

@@ -26,22 +26,12 @@ from typing import Any
 import numpy as np
 import shapely
 
+from symphony.data import segment as schema
 from symphony.data.resample import evened, wrap
-from symphony.data.segment import (
-    MAX_STEPS,
-    AgentType,
-    Bools,
-    Floats,
-    LaneType,
-    MarkType,
-    RoadMap,
-    RunSegment,
-    SignalState,
-    check_counts,
-)
+from symphony.data.segment import AgentType, Bools, LaneType, MarkType, RoadMap, RunSegment, SignalState
 from symphony.data.sources import base, lines
 from symphony.data.sources.base import Doubles, Item, Reader, located, motion, refuse
-from symphony.data.sources.lines import Lane, Links
+from symphony.data.sources.lines import Lane, Lights, Links
 from symphony.data.sources.safe_pickle import Array, load_plain
 from symphony.errors import DataError
 
@@ -88,7 +78,7 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
         times = _numbers(metadata["ts"], "ts", scenario["length"], 1)[:, 0]
         steps, ego, dataset = len(times), metadata["sdc_id"], str(metadata.get("dataset", ""))
         place, date = metadata.get("map"), metadata.get("date", metadata.get("log_name"))
-        refuse(not 2 <= steps <= MAX_STEPS, f"{steps} steps, expected 2 … {MAX_STEPS}")
+        refuse(not 2 <= steps <= schema.MAX_STEPS, f"{steps} steps, expected 2 … {schema.MAX_STEPS}")
         dt = base.time_step(times, "metadata: ts")
     names, kinds, states, valid = _tracks(scenario, steps)
     refuse(ego not in names, "names no track that is valid at some step", "metadata: sdc_id")
@@ -125,7 +115,7 @@ def _tracks(scenario: Mapping[Any, Any], steps: int) -> tuple[list[str], list[in
     found: list[tuple[str, int, Doubles, Bools]] = []
     with located(field="tracks"):
         tracks = scenario["tracks"].items()
-        check_counts(len(tracks), steps, "tracks")
+        schema.check_counts(len(tracks), steps, "tracks")
     for key, track in tracks:
         with located(field=f"tracks {str(key)[:60]}"):
             state = track["state"]
@@ -152,26 +142,24 @@ def _numbers(value: Array, name: str, steps: Any, width: int) -> Doubles:
     return found.astype(np.float64).reshape(-1, columns)[:, :width]
 
 
-def _sizes(sizes: Doubles, valid: Bools, ego: int) -> Floats:
+def _sizes(sizes: Doubles, valid: Bools, ego: int) -> schema.Floats:
     """Return [A, 3] from [A, T, 3]; the ego is at least as long as wide."""
     found = np.array([np.median(size[mask], axis=0) for size, mask in zip(sizes, valid, strict=True)])
     found[ego, :2] = np.sort(found[ego, :2])[::-1]
     return base.to_float32(found)
 
 
-def _signals(
-    states: Any, lanes: Sequence[Lane], steps: int, dataset: str
-) -> dict[int, tuple[Doubles, list[int]]]:
-    """Return lane -> (stop point [3], state [T])."""
+def _signals(states: Any, lanes: Sequence[Lane], steps: int, dataset: str) -> Lights:
+    """Return the lights of the lanes."""
     index = {lane.name: k for k, lane in enumerate(lanes)}
-    found: dict[int, tuple[Doubles, list[int]]] = {}
+    found: Lights = {}
     with located(field="dynamic_map_states"):
         for key, light in states.items():
             lane = index.get(str(light.get("lane", key)))
             logged = light["state"]["object_state"]
             logged = [_LIGHTS[str(state)] for state in getattr(logged, "value", logged)]
-            if len(logged) != steps:
-                raise DataError(f"{len(logged)} states for {steps} steps", field=f"dynamic_map_states {key}")
+            here, count = f"dynamic_map_states {key}", len(logged)
+            refuse(count != steps, f"{count} states for {steps} steps", here)
             if lane is None or lane in found:
                 continue
             stop = light.get("stop_point")
@@ -196,10 +184,8 @@ def _map(scenario: Mapping[Any, Any], dataset: str, origin: Doubles) -> tuple[Ro
         features = scenario["map_features"].items()
     for key, node in features:
         with located(field=f"map_features {str(key)[:60]}"):
-            kind, line, area = (
-                str(node.get("type")),
-                *(_points(node.get(n, ())) for n in ("polyline", "polygon")),
-            )
+            kind = str(node.get("type"))
+            line, area = (_points(node.get(name, ())) for name in ("polyline", "polygon"))
             if dataset == "nuscenes":
                 line = line[:, :2]  # the third number is a heading
             if kind in _LANES and len(line):
@@ -235,9 +221,8 @@ def _lane(name: str, node: Mapping[Any, Any], line: Doubles, area: Doubles | Non
     limit = node.get("speed_limit_kmh")
     known = isinstance(limit, int | float) and 0 < limit < 300 and dataset not in _NO_LIMITS
     # Of nuPlan, ScenarioNet names all lanes of a road, in an order that need not be theirs.
-    left, right = (
-        () if dataset == "nuplan" else _references(node.get(f"{side}_neighbor")) for side in ("left", "right")
-    )
+    sides = (None if dataset == "nuplan" else node.get(f"{side}_neighbor") for side in ("left", "right"))
+    left, right = map(_references, sides)
     return Lane(
         name=name,
         line=line,
@@ -302,10 +287,8 @@ def _side(one: Doubles, two: Doubles) -> int:
     there = long.project(spot)
     if not BESIDE[0] <= spot.distance(long) <= BESIDE[1] or not 0.5 < there < long.length - 0.5:
         return 0
-    pieces = [
-        np.array([line.interpolate(at + d).coords[0] for d in (-0.5, 0.5)])
-        for line, at in ((short, half), (long, there))
-    ]
+    places = ((short, half), (long, there))
+    pieces = [np.array([line.interpolate(at + d).coords[0] for d in (-0.5, 0.5)]) for line, at in places]
     along, onward = (piece[1] - piece[0] for piece in pieces)
     across = pieces[1].mean(axis=0) - pieces[0].mean(axis=0)
     if along @ onward < np.cos(TURN / 2) * np.hypot(*along) * np.hypot(*onward):
@@ -369,8 +352,8 @@ def _points(value: Any) -> Doubles:
     if isinstance(value, list | tuple):
         rows = [row.value.tolist() if isinstance(row, Array) else row for row in value]
         # Looked at one by one: lists in lists may be larger than any memory.
-        if not all(len(row) in {2, 3} and all(isinstance(n, int | float) for n in row) for row in rows):
-            raise DataError("not a list of points")
+        fine = (len(row) in {2, 3} and all(isinstance(n, int | float) for n in row) for row in rows)
+        refuse(not all(fine), "not a list of points")
         found = np.array(rows, np.float64)
     else:
         refuse(value.value.dtype.kind not in "bfiu", f"{value.value.dtype}, expected points")

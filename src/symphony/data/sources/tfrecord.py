@@ -29,13 +29,9 @@ def masked_crc32c(data: bytes) -> int:
 def read_records(path: Path) -> Iterator[bytes | DataError]:
     """Yield the payload of each record; both checksums are verified.
 
-    A payload with a wrong checksum, or of more than :data:`MAX_RECORD` bytes, is yielded as a :class:`DataError`,
-    and reading goes on with the next record.
-
-    Raises:
-        DataError: the file is empty or cut short, or a length has a wrong checksum, so that there is no telling
-            where the next record begins.
-        OSError: the file can't be opened or read.
+    A payload with a wrong checksum, or of more than :data:`MAX_RECORD` bytes, is yielded as a :class:`DataError`, and
+    reading goes on with the next record. One is raised where the file is empty or cut short, or a length has a wrong
+    checksum, so that there is no telling where the next record begins.
     """
     with path.open("rb") as file:
         left = os.fstat(file.fileno()).st_size
@@ -51,9 +47,8 @@ def read_records(path: Path) -> Iterator[bytes | DataError]:
             length, check = _HEADER.unpack(header)
             if masked_crc32c(header[:8]) != check:
                 kind = "not a TFRecord file, or damaged" if index == 0 else "damaged"
-                raise DataError(
-                    f"{kind}: the checksum of the record's length is wrong", file=path, field=where
-                )
+                message = f"{kind}: the checksum of the record's length is wrong"
+                raise DataError(message, file=path, field=where)
             size = length + _CHECK.size
             left -= _HEADER.size + size
             if left < 0:

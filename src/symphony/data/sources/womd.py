@@ -21,24 +21,14 @@ from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from numpy.typing import NDArray
 
+from symphony.data import segment as schema
 from symphony.data.resample import evened
-from symphony.data.segment import (
-    MAX_AGENTS,
-    AgentType,
-    Bools,
-    LaneType,
-    MarkType,
-    RunSegment,
-    SignalState,
-    check_counts,
-    check_signals,
-)
+from symphony.data.segment import AgentType, Bools, LaneType, MarkType, RunSegment, SignalState
 from symphony.data.sources import base, lines
 from symphony.data.sources import womd_pb2 as pb
 from symphony.data.sources.base import Doubles, Item, Reader, motion, refuse
-from symphony.data.sources.lines import Lane
+from symphony.data.sources.lines import Codes, Lane, Lights, Mark
 from symphony.data.sources.tfrecord import read_records
 from symphony.errors import DataError
 
@@ -65,12 +55,10 @@ class WomdReader(Reader):
 
     def _read(self, path: Path) -> Iterator[Item]:
         for index, payload in enumerate(read_records(path)):
-            yield (
-                payload if isinstance(payload, DataError) else self._convert(payload, path, f"record {index}")
-            )
+            yield payload if isinstance(payload, DataError) else self._convert(payload, path, index)
 
-    def _convert(self, payload: bytes, path: Path, record: str) -> Item:
-        name = None
+    def _convert(self, payload: bytes, path: Path, index: int) -> Item:
+        name, record = None, f"record {index}"
         try:
             scenario = pb.Scenario.FromString(payload)
             name = _name(scenario)
@@ -99,7 +87,7 @@ def scenario_to_segment(scenario: pb.Scenario, file: str = "") -> RunSegment:
     origin = np.round(states[ego, np.argmax(valid[ego]), :3])
     lanes, boundary, marks = _features(scenario.map_features)
     for field in ("tracks_to_predict", "objects_of_interest"):
-        _check_count(len(getattr(scenario, field)), MAX_AGENTS, field)
+        _check_count(len(getattr(scenario, field)), schema.MAX_AGENTS, field)
     tracks = [scenario.tracks[i] for i in kept]
     ids = np.array([track.id for track in tracks], np.int64)
     predict = [_index(p.track_index, renumber, "tracks_to_predict") for p in scenario.tracks_to_predict]
@@ -129,7 +117,7 @@ def _check_count(count: int, most: int, field: str) -> None:
     refuse(count > most, f"{count} entries, at most {most} are read", field)
 
 
-def _codes(numbers: Sequence[int], count: int, field: str) -> NDArray[np.uint8]:
+def _codes(numbers: Sequence[int], count: int, field: str) -> Codes:
     """Return enumeration values as uint8; a :class:`DataError` where one is outside 0 … count - 1."""
     values = np.array(numbers, np.int64)
     bad = values[(values < 0) | (values >= count)]
@@ -149,7 +137,7 @@ def _tracks(scenario: pb.Scenario, steps: int) -> tuple[Doubles, list[int], dict
     """Return states [A, T, 10], the tracks they are, and track index in the record -> row, -1 where left out."""
     tracks = scenario.tracks
     refuse(not tracks, "has no agents", "tracks")
-    check_counts(len(tracks), steps, "tracks")
+    schema.check_counts(len(tracks), steps, "tracks")
     for track in tracks:
         count = len(track.states)
         refuse(count != steps, f"track {track.id} has {count} states for {steps} steps", "tracks.states")
@@ -179,14 +167,12 @@ def _points(points: Iterable[pb.MapPoint]) -> Doubles:
     return np.fromiter(chain.from_iterable(map(_POINT, points)), np.float64).reshape(-1, 3)
 
 
-def _features(
-    features: Sequence[pb.MapFeature],
-) -> tuple[list[Lane], list[Doubles], list[tuple[Doubles, MarkType]]]:
-    """Return lanes, road edges, and marks with their types."""
+def _features(features: Sequence[pb.MapFeature]) -> tuple[list[Lane], list[Doubles], list[Mark]]:
+    """Return lanes, road edges and marks."""
     _check_count(len(features), MAX_FEATURES, "map_features")
     found: list[tuple[int, Any]] = []
     edges: list[Doubles] = []
-    marks: list[tuple[Doubles, MarkType]] = []
+    marks: list[Mark] = []
     for feature in features:
         kind = feature.WhichOneof("feature_data")
         if kind == "lane" and len(feature.lane.polyline) >= 1:
@@ -219,10 +205,8 @@ def _features(
     return lanes, edges, marks
 
 
-def _signals(
-    scenario: pb.Scenario, steps: int, lanes: Sequence[Lane]
-) -> dict[int, tuple[Doubles, NDArray[np.uint8]]]:
-    """Return lane -> (stop point [3], state [T])."""
+def _signals(scenario: pb.Scenario, steps: int, lanes: Sequence[Lane]) -> Lights:
+    """Return the lights of the lanes."""
     logged = scenario.dynamic_map_states
     refuse(logged and len(logged) != steps, f"{len(logged)} entries for {steps} steps", "dynamic_map_states")
     _check_count(sum(len(now.lane_states) for now in logged), MAX_LINKS, "dynamic_map_states")
@@ -237,7 +221,7 @@ def _signals(
                     given = light.HasField("stop_point")
                     stops[lane] = _points([light.stop_point])[0] if given else lanes[lane].line[0]
                 entries.append((lane, step, light.state))
-    check_signals(len(stops), steps, "dynamic_map_states")
+    schema.check_signals(len(stops), steps, "dynamic_map_states")
     states = _codes([state for *_, state in entries], len(SignalState), "dynamic_map_states.state")
     found = {lane: np.full(steps, SignalState.UNKNOWN, np.uint8) for lane in stops}
     for (lane, step, _), state in zip(entries, states.tolist(), strict=True):

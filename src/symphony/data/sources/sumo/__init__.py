@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,16 +18,7 @@ from symphony.data.sources.sumo.roads import read_network
 from symphony.data.sources.sumo.traffic import simulate_traffic, write_demand
 from symphony.errors import ConfigError
 
-__all__ = [
-    "KINDS",
-    "CropRule",
-    "Generated",
-    "crop_rule",
-    "generate_run",
-    "is_own",
-    "kind_name",
-    "sumo_version",
-]
+__all__ = ["KINDS", "CropRule", "crop_rule", "generate_run", "is_own", "kind_name", "sumo_version"]
 
 KINDS = tuple(NETWORKS)  # kinds of network that generate_run knows
 WARM_UP = 30.0  # simulated seconds before the first segment starts, at least
@@ -38,42 +28,29 @@ SUBLANE_SHARE = 1 / 3
 _SLOW = 10.0  # m/s at which a longer freeway fills during a longer warm-up
 
 
-class Generated(NamedTuple):
-    """The segments of one simulation, and how many windows gave none, and why."""
-
-    segments: list[RunSegment]
-    reasons: Counter[str]
-
-
 def generate_run(
     kind: str, seed: int, duration: float = 150.0, *, rule: CropRule | None = None, straight: float = 1.0
-) -> Generated:
+) -> tuple[list[RunSegment], Counter[str]]:
     """Make one network, simulate its traffic once and cut run segments at 5 Hz out of it.
 
+    Gives the segments, and how many windows gave none for which reason.
     The light of a movement is attached to the connector lane inside the junction, which only that movement
     takes; its stop point is the end of the lane before. Equal arguments give equal segments. Segments of one focus
     share one map object.
 
-    Args:
-        kind: one of :data:`KINDS`, or a file of roads of one's own (:data:`.networks.OWN_ROADS`).
-        seed: of every random choice; another seed is another network.
-        duration: recorded seconds, after a warm-up.
-        rule: how maps and egos are chosen, and how long segments are; by default the kind's own for 10 s.
-        straight: how many times likelier a route goes straight on at a junction than it takes one of the turns.
-
-    Raises:
-        ConfigError: unknown kind, a bad duration or seed.
-        DataError: SUMO is not installed or failed (with its message).
+    A kind is one of :data:`KINDS`, or a file of roads of one's own (:data:`.networks.OWN_ROADS`); another seed is
+    another network. ``duration`` is what is recorded, in seconds, after a warm-up. ``rule`` says how maps and egos
+    are chosen, and how long segments are; by default the kind's own for 10 s. At a junction a route goes ``straight``
+    on so many times likelier than it takes one of the turns. A :class:`ConfigError` says what is wrong with an
+    argument, a :class:`DataError` if SUMO is not installed or failed, with its message.
     """
     own, ramp = is_own(kind), kind == "ramp"
     if kind not in NETWORKS and not own:
         raise ConfigError(f"unknown kind of network {kind!r} (known: {', '.join(KINDS)})")
     rule = rule or crop_rule(kind)
     if not duration >= rule.steps * DT or seed < 0:
-        least = f"{rule.steps * DT:.1f} s"
-        raise ConfigError(
-            f"needs a seed from 0, is {seed}, and a duration of at least {least}, is {duration}"
-        )
+        least = f"a duration of at least {rule.steps * DT:.1f} s"
+        raise ConfigError(f"needs a seed from 0, is {seed}, and {least}, is {duration}")
     seeds = np.random.SeedSequence([seed, _OWN if own else KINDS.index(kind)]).spawn(4)
     roads_rng, demand_rng, drive_rng, cut_rng = (np.random.default_rng(each) for each in seeds)
     with scratch() as folder:
@@ -89,8 +66,7 @@ def generate_run(
         sublane = bool(drive_rng.random() < SUBLANE_SHARE)
         warm_up = WARM_UP * (_OWN_FILLS if own else 1) + longer / _SLOW
         end = warm_up + duration
-        size = write_demand(
-            network, demand_rng, folder, end, through=through, sublane=sublane, straight=straight
-        )
+        how = {"through": through, "sublane": sublane}
+        size = write_demand(network, demand_rng, folder, end, **how, straight=straight)
         traffic = simulate_traffic(file, network, size, drive_rng, end, warm_up, sublane=sublane)
-    return Generated(*cut_segments(f"sumo-{kind_name(kind)}-{seed:06d}", network, traffic, cut_rng, rule))
+    return cut_segments(f"sumo-{kind_name(kind)}-{seed:06d}", network, traffic, cut_rng, rule)

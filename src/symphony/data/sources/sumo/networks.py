@@ -31,6 +31,7 @@ RAMP_RADIUS = 190.0
 OWN_ROADS = {".xodr": "--opendrive-files", ".osm": "--osm-files", ".net.xml": "--sumo-net-file"}
 """Endings of road networks of one's own (OpenDRIVE, OpenStreetMap, SUMO), and how ``netconvert`` is told of them."""
 
+Random = np.random.Generator
 Pairs = list[tuple[int, int]]
 Road = tuple[int, float, float]  # lanes, speed limit, width of a lane
 
@@ -48,16 +49,14 @@ class PlainNetwork:
         size = "" if radius is None else f' radius="{radius:.2f}"'
         self.nodes.append(f'<node id="{name}" x="{point[0]:.2f}" y="{point[1]:.2f}" type="{control}"{size}/>')
 
-    def edge(
-        self, ends: tuple[str, str], shape: Doubles, road: Road, priority: int, spread: str = "right"
-    ) -> str:
+    def edge(self, ends: tuple[str, str], line: Doubles, road: Road, rank: int, spread: str = "right") -> str:
         """Add a one-way edge and return its id."""
         name = "_".join(ends)
-        points = " ".join(f"{x:.2f},{y:.2f}" for x, y in shape)
+        points = " ".join(f"{x:.2f},{y:.2f}" for x, y in line)
         lanes, speed, width = road
         self.edges.append(
             f'<edge id="{name}" from="{ends[0]}" to="{ends[1]}" numLanes="{lanes}" speed="{speed:.2f}" '
-            f'width="{width:.2f}" priority="{priority}" spreadType="{spread}" shape="{points}"/>'
+            f'width="{width:.2f}" priority="{rank}" spreadType="{spread}" shape="{points}"/>'
         )
         return name
 
@@ -78,7 +77,7 @@ class PlainNetwork:
         return folder / "net.net.xml"
 
 
-def _signal_layout(rng: np.random.Generator) -> str:
+def _signal_layout(rng: Random) -> str:
     # "opposites" makes left turns wait for gaps; with it alone, dense junctions lock up.
     return "opposites" if rng.random() < 0.25 else "incoming"
 
@@ -95,7 +94,7 @@ class _Link:
     speed: float
 
 
-def _town_links(rng: np.random.Generator, columns: int, rows: int) -> Pairs:
+def _town_links(rng: Random, columns: int, rows: int) -> Pairs:
     """Return neighbours in the grid, some pairs dropped while every node keeps two streets and all connect."""
     index = np.arange(columns * rows).reshape(rows, columns)
     across = zip(index[:, :-1].ravel(), index[:, 1:].ravel(), strict=True)
@@ -127,7 +126,7 @@ def _bezier(start: Doubles, end: Doubles, bend: Doubles, count: int = 12) -> Dou
     return (1 - t) ** 3 * start + 3 * t * (1 - t) ** 2 * first + 3 * t**2 * (1 - t) * second + t**3 * end
 
 
-def _street(rng: np.random.Generator, nodes: Doubles, links: list[_Link], a: int, b: int) -> Doubles:
+def _street(rng: Random, nodes: Doubles, links: list[_Link], a: int, b: int) -> Doubles:
     """Return a centre line from node a to b: bent, unless it would meet a street there is at a sharp angle."""
     straight = _bezier(nodes[a], nodes[b], np.zeros(2))
     if rng.random() > 0.7:
@@ -146,11 +145,8 @@ def _street(rng: np.random.Generator, nodes: Doubles, links: list[_Link], a: int
 
 def _departures(links: list[_Link], node: int) -> list[float]:
     """Return the directions in which the streets at a node leave it."""
-    return [
-        _departure(link.line if link.a == node else link.line[::-1])
-        for link in links
-        if node in (link.a, link.b)
-    ]
+    here = (link for link in links if node in (link.a, link.b))
+    return [_departure(link.line if link.a == node else link.line[::-1]) for link in here]
 
 
 def _departure(line: Doubles) -> float:
@@ -172,7 +168,7 @@ def _rotation(angle: float) -> Doubles:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def town(rng: np.random.Generator, folder: Path) -> Path:
+def town(rng: Random, folder: Path) -> Path:
     """Make a jittered and rotated grid of curved streets with T-junctions, mixed control and roundabouts."""
     columns, rows = int(rng.integers(3, 6)), int(rng.integers(3, 5))
     step = rng.uniform(75, 115, 2)
@@ -246,9 +242,7 @@ class _Ring:
         net.edges.append(f'<roundabout nodes="{nodes}" edges="{" ".join(names)}"/>')
 
 
-def _add_nodes(
-    net: PlainNetwork, rng: np.random.Generator, nodes: Doubles, links: list[_Link]
-) -> dict[int, _Ring]:
+def _add_nodes(net: PlainNetwork, rng: Random, nodes: Doubles, links: list[_Link]) -> dict[int, _Ring]:
     """Add a junction per node, except where a roundabout takes its place; return the roundabouts."""
     rings: dict[int, _Ring] = {}
     wanted = int(rng.integers(0, 4))
@@ -273,7 +267,7 @@ def _add_nodes(
     return rings
 
 
-def grid(rng: np.random.Generator, folder: Path) -> Path:
+def grid(rng: Random, folder: Path) -> Path:
     """Make a perturbed rectangular grid with left-turn pockets; one kind of control for all junctions."""
     controls = ["traffic_light", "priority", "allway_stop", "right_before_left"]
     control = str(rng.choice(controls, p=[0.4, 0.2, 0.2, 0.2]))
@@ -293,7 +287,7 @@ def grid(rng: np.random.Generator, folder: Path) -> Path:
     return folder / "net.net.xml"
 
 
-def freeway(rng: np.random.Generator, folder: Path, longer: float = 0.0) -> Path:
+def freeway(rng: Random, folder: Path, longer: float = 0.0) -> Path:
     """Make two carriageways, each with an on-ramp and an off-ramp: apart or joined by a weaving lane.
 
     All ends, those of the ramps too, are ``longer`` metres farther out than :data:`RAMP_RADIUS` asks for.
@@ -306,21 +300,13 @@ def freeway(rng: np.random.Generator, folder: Path, longer: float = 0.0) -> Path
     curvature = rng.uniform(-1, 1) / 1500 * (600 / (600 + longer))
     for side in range(2):
         road, bend = (int(rng.integers(2, 4)), speed, width), curvature * (1 - 2 * side)
-        _carriageway(net, rng, f"c{side}", road, direction + side * np.pi, bend, longer)
+        _carriageway(net, rng, f"c{side}", road, (direction + side * np.pi, bend, longer))
     return net.compile(folder, "--default.junctions.radius 4 --junctions.scurve-stretch 1.5")
 
 
-def _carriageway(
-    net: PlainNetwork,
-    rng: np.random.Generator,
-    name: str,
-    road: Road,
-    direction: float,
-    curvature: float,
-    longer: float,
-) -> None:
+def _carriageway(net: PlainNetwork, rng: Random, name: str, road: Road, course: tuple[float, ...]) -> None:
     """Add one direction of a freeway: base, stretch beside the on-ramp, gap, stretch beside the off-ramp, end."""
-    lanes, speed, width = road
+    (lanes, speed, width), (direction, curvature, longer) = road, course
     weaving = rng.random() < 0.4
     stations = np.cumsum([0, 300 + longer, rng.uniform(180, 260), 0 if weaving else rng.uniform(120, 200)])
     stations = np.append(stations, [stations[-1] + (0 if weaving else rng.uniform(130, 180))])
@@ -346,7 +332,6 @@ def _carriageway(
         ids.append(net.edge((names[k], names[k + 1]), line, (lanes + more, speed, width), 9))
     for k in range(len(extra) - 1):
         net.connect(ids[k], ids[k + 1], [(i + extra[k], i + extra[k + 1]) for i in range(lanes)])
-
     ramp_speed, edge = rng.uniform(15.5, 20), lanes * width
     on, off = 1, len(extra) - 1
     # Ramps are longer than a crop's radius, so that their ends are never on a map.
@@ -390,6 +375,5 @@ def own_network(file: Path, folder: Path) -> Path:
         return folder / "net.net.xml"
 
 
-Maker = Callable[[np.random.Generator, Path], Path]
-NETWORKS: dict[str, Maker] = {"town": town, "grid": grid, "ramp": freeway}
+NETWORKS: dict[str, Callable[[Random, Path], Path]] = {"town": town, "grid": grid, "ramp": freeway}
 """Kinds of network; each function writes files into a folder and returns the path of the network."""

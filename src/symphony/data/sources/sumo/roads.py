@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET  # files are our own
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -79,12 +80,6 @@ class Network:
                 step = sign * (piece[far] - piece[0])
                 out[self.edge[k]] = np.arctan2(step[1], step[0])
         return first, last
-
-    def edge_speed(self) -> Doubles:
-        """Return the speed limit per edge."""
-        speed = np.zeros(len(self.edge_names))
-        np.maximum.at(speed, self.edge, self.speed)
-        return speed
 
 
 def _shape(text: str) -> Doubles:
@@ -244,9 +239,8 @@ def _drivable(network: Network, center: Doubles, radius: float) -> Polygon | Mul
     circle = Point(0, 0).buffer(radius + 20)
     lines = np.array([shapely.LineString(line - center) for line in network.lanes], dtype=object)
     near = shapely.intersects(lines, circle)
-    strips = shapely.buffer(
-        lines[near], network.width[near] / 2, cap_style="flat", join_style="mitre", mitre_limit=2.0
-    )
+    flat: dict[str, Any] = {"cap_style": "flat", "join_style": "mitre", "mitre_limit": 2.0}
+    strips = shapely.buffer(lines[near], network.width[near] / 2, **flat)
     shapes = np.array([Polygon(s - center) for s in network.junction_shapes], dtype=object)
     shapes = shapely.make_valid(shapes[shapely.intersects(shapes, circle)])
     union = shapely.union_all(np.concatenate([strips, shapes]))

@@ -84,7 +84,7 @@ def write_demand(
     """
     types, sizes, shares = _types(rng, sublane)
     following, length, lanes = network.edge_graph()
-    speed = float(network.edge_speed().max())
+    speed = float(network.speed.max())
     chance: list[Doubles] = []
     if straight != 1.0:
         first, last = network.edge_headings()
@@ -175,9 +175,8 @@ def simulate_traffic(
     velocity = np.gradient(position, STEP, axis=1)
     # At both ends of a track the difference is with an absent neighbour.
     present = np.asarray(np.isfinite(velocity).all(axis=-1))
-    lights = {
-        light: _read_lights(folder / f"lights{k}.xml", time) for k, light in enumerate(network.connectors)
-    }
+    files = ((light, folder / f"lights{k}.xml") for k, light in enumerate(network.connectors))
+    lights = {light: _read_lights(file, time) for light, file in files}
     return Traffic(size, position, heading, velocity, present, lights)
 
 
@@ -244,8 +243,6 @@ def _gaussian(paths: Doubles) -> Doubles:
 def _read_lights(file: Path, time: Doubles) -> NDArray[np.uint8]:
     """Return [links, N] states of one traffic light from its switches."""
     switches = [(float(e.attrib["time"]), e.attrib["state"]) for e in ET.parse(file).getroot()]  # noqa: S314
-    states = np.array(
-        [[_STATES.get(letter, SignalState.UNKNOWN) for letter in state] for _, state in switches], np.uint8
-    )
+    states = np.array([[_STATES.get(letter, 0) for letter in state] for _, state in switches], np.uint8)
     at = np.searchsorted([t for t, _ in switches], time + 1e-6, side="right") - 1
     return states[at.clip(0)].T.copy()
