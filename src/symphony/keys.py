@@ -22,7 +22,6 @@ BACKGROUND: Key = ("agents", "background")  # [..., N, 4]: the same, as a rule m
 GOAL: Key = ("agents", "goal")  # [..., N] int64: the route followed, a row of its scene's table; -1 for none
 GOAL_SET: Key = ("agents", "goal_set")  # [..., N, G] bool: routes among which an expert's log does not tell
 PROGRESS: Key = ("agents", "progress")  # [..., N]: metres come along the route from its begin; 0 without one
-PERSONA: Key = ("agents", "persona")  # [..., N, 2]: headway and speed, from -1 (shortest, slowest) to 1
 ACTION: Key = ("agents", "action")  # [..., N] int64 (bicycle) or [..., N, 2] (displacement)
 LOGITS: Key = ("agents", "logits")
 LOG_PROB: Key = ("agents", "action_log_prob")  # [..., N]: of the action, where it is asked for

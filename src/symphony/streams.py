@@ -20,7 +20,6 @@ class Stream(IntEnum):
     GOALS = 1 << 40  # routes of the agents of a scene
     PRUNING = (1 << 40) + 1  # which branches go on
     PLANNERS = (1 << 40) + 3  # seeds of the planners of egos
-    PERSONAS = (1 << 40) + 4  # styles of driving
     WALKS = (1 << 40) + 5  # how people walk whom nobody drives
     BACKTRACKING = 1 << 41  # lines that go back, each of its tries: this and how many there were
 

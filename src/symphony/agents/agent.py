@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import nn
 
 from symphony.agents import networks
 from symphony.agents.checkpoint import CheckpointError, load_checkpoint
@@ -78,11 +78,6 @@ class Agent:
     def searches(self) -> bool:
         """Whether it is meant to be simulated with the search."""
         return self.spec is not None and self.spec.searches
-
-    @property
-    def personas(self) -> Tensor | None:
-        """[M, 2] personas to draw from, equally likely; None for agents without."""
-        return getattr(self.policy, "personas", None)
 
     @property
     def routed(self) -> bool:

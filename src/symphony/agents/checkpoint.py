@@ -101,7 +101,6 @@ def load_checkpoint(
     optimizers: Mapping[str, Any] | None = None,
     partial: bool = False,
     restore_rng: bool = True,
-    widen: bool = False,
 ) -> LoadedCheckpoint:
     """Restore what is passed from the checkpoint folder `path`; no module is changed unless all fit.
 
@@ -111,8 +110,6 @@ def load_checkpoint(
         optimizers: by the names they were saved under.
         partial: allow the checkpoint to hold more than is asked for (evaluation needs the policy only).
         restore_rng: also set the global random states of Python, numpy and torch.
-        widen: let modules have further inputs after those that were saved: columns that a saved matrix lacks are 0,
-            so that they change nothing at first, and buffers that it lacks are left as they are.
 
     Raises:
         CheckpointError: if the folder is no complete checkpoint of this format, a checksum fails, names, shapes or
@@ -133,7 +130,6 @@ def load_checkpoint(
         raise CheckpointError(found, file=file, field="rng")
     for part, item in asked.items():
         if isinstance(item, nn.Module):
-            states[part] = _widened(item, states[part]) if widen else states[part]
             _match(path / f"{part}.safetensors", item.state_dict(), states[part])
     for part, item in reversed(asked.items()):  # optimizers first, of which one may still dislike its state
         try:
@@ -349,19 +345,6 @@ def decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
     if kind != "tuple":
         raise ValueError(f"unknown kind {kind!r}")
     return tuple(items)
-
-
-def _widened(module: nn.Module, saved: dict[str, Any]) -> dict[str, Any]:
-    """A state with the columns and buffers that a module has beyond it."""
-    found, buffers = dict(saved), dict(module.named_buffers())
-    for name, own in module.state_dict().items():
-        there = saved.get(name)
-        if there is None and name in buffers:
-            found[name] = own.clone()
-        elif isinstance(there, Tensor) and there.ndim == own.ndim == 2:
-            missing = own.shape[1] - there.shape[1]
-            found[name] = nn.functional.pad(there, (0, missing)) if missing > 0 else there
-    return found
 
 
 def _rng_state() -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 
 from symphony import keys, modules
@@ -18,8 +17,6 @@ from symphony.modules.encoder import FORESIGHT, ElementGroup, SceneEncoder
 
 RADIUS = 20.0
 """Metres around an agent that its discriminator observes."""
-PERSONAS = 1024
-"""Personas kept with an agent, to be drawn from."""
 
 
 def dynamics_of(spec: AgentSpec) -> Bicycle | Displacement:
@@ -48,7 +45,6 @@ def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> Observatio
         turns=spec.goals and spec.agent.goal_features == "turns",
         along=gaps and spec.goals,
         gaps=gaps,
-        persona=spec.agent.persona,
         clearance=features != "paper",
         foresight=FORESIGHT if gaps or features == "foresight" else (),
     )
@@ -71,22 +67,15 @@ def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     """Actions from observations, and from the route that is the goal: a categorical over the joint actions of the
     bicycle, or a Gaussian or a histogram over displacements. Seed torch beforehand.
     """
-    policy = build_object(spec.agent.policy, spec) if spec.agent.policy != "paper" else _policy(spec)
-    if spec.agent.persona:
-        # What personas are drawn from travels with the weights that were trained on them.
-        policy.register_buffer("personas", torch.zeros(PERSONAS, 2))
-    return policy
-
-
-def _policy(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
+    if spec.agent.policy != "paper":
+        return build_object(spec.agent.policy, spec)
     sizes: dict[str, Any] = {
         "hidden": spec.agent.hidden,
         "head": (2 * spec.agent.hidden, 2 * spec.agent.hidden),
-        "own_keys": (*_own_keys(spec), keys.PERSONA) if spec.agent.persona else _own_keys(spec),
+        "own_keys": _own_keys(spec),
         "encoder": _encoder(spec),
     }
-    own = _own_features(spec) + 2 * spec.agent.persona
-    dynamics, groups = dynamics_of(spec), _groups(spec, route=True)
+    own, dynamics, groups = _own_features(spec), dynamics_of(spec), _groups(spec, route=True)
     if isinstance(dynamics, Bicycle):
         return modules.discrete_policy(own, groups, actions=dynamics.num_actions, **sizes)
     sizes |= {"size_scale": observation_of(spec).size_scale, "cells": spec.agent.cells}

@@ -31,7 +31,7 @@ BUILTIN = "builtin:"
 """Before the split of the run segments that come with the package."""
 _NUMBER = (int, float)
 _CROWD = {"interactive": (int, str), "others": str, "search": str, "score": str, "branches": int}
-_CROWD |= {"radius": _NUMBER, "persona": str, "duration": int}
+_CROWD |= {"radius": _NUMBER, "duration": int}
 """Settings of :class:`symphony.config.EvaluateConfig` that a crowd may have."""
 _SUITE = {"name": str, "data": str, "segments": (int, list), "hardest": int, "rollouts": int, "seed": int}
 _LIMIT = {"metric": str, "at_most": _NUMBER, "at_least": _NUMBER, "planners": list, "crowds": list}

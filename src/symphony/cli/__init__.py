@@ -41,6 +41,10 @@ GONE = {
     "table --paired": "`python benchmarks/relations.py RUN ... --paired METHOD` of a checkout prints them",
     "table --each": "a method that was simulated in several ways has a row for each",
     "table --columns": "`symphony evaluate RUN --data DIR --details` prints these numbers",
+    **dict.fromkeys(
+        ("train --agent.persona", "evaluate --persona", "simulate --persona"),
+        "agents have no driving styles to be told; no figure spoke for them",
+    ),
     "simulate --agents": "the agent is named without an option: `symphony simulate RUN --data DIR --out SIM`",
 }
 """Commands and options that are gone, and what takes their place."""

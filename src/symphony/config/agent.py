@@ -43,16 +43,17 @@ class AgentConfig(Settings):
     #: Cells along and across of a histogram that displacements are drawn from, an odd number (methods mgail*; 0: one
     #: Gaussian instead, as in the paper).
     cells: Annotated[int, Bounds(0, 1001)] = 0
-    #: Drive in styles: the policy is told how closely the vehicle follows and how fast it drives among those of the
-    #: log; in simulations that is drawn for each rollout, or given.
-    persona: bool = False
     hidden: Count = 64  # Width of the element encoders; the action head is twice as wide.
     #: Encoder of policy and goal policy. `paper`: element MLPs and max-pool; or the import path of your own, with the
     #: signature of `symphony.modules.SceneEncoder`.
     encoder: Own = "paper"
     #: Policy: `paper`, or the import path of a function from an `AgentSpec` to a policy module.
     policy: Own = "paper"
-    GONE: ClassVar = {"num_objects": 16, "head": lambda values: 2 * values.get("hidden", 64)}
+    GONE: ClassVar = {
+        "num_objects": 16,
+        "persona": False,
+        "head": lambda values: 2 * values.get("hidden", 64),
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()

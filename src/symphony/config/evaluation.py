@@ -26,21 +26,6 @@ TOGETHER = 64
 """Run segments simulated at a time, at most, unless more are asked for: with more, each costs no less."""
 MOST_SECONDS = 1e6
 """Seconds that a planner can be given for an answer, at most."""
-PERSONA_PARTS = ("headway", "speed")
-"""What a persona consists of, in the order of its numbers."""
-
-
-def persona_quantiles(text: str) -> dict[str, float]:
-    """From ``headway=.8,speed=.3`` to numbers from 0 to 1 by name; ConfigError for anything else."""
-    try:
-        pairs = [part.partition("=") for part in text.split(",") if text]
-        found = {name: float(number) for name, _, number in pairs}
-    except ValueError:
-        found = {"": -1.0}
-    good = found.keys() <= {*PERSONA_PARTS} and all(0 <= number <= 1 for number in found.values())
-    if not good or text.count("=") > len(found):
-        raise ConfigError(f"a persona is such as headway=.8,speed=.3 (quantiles from 0 to 1), not '{text}'")
-    return found
 
 
 def check_planner_seconds(seconds: float) -> None:
@@ -104,9 +89,6 @@ class EvaluateConfig(SimulationConfig):
     #: Search trees per run segment, each with goals of its own; each gives its share of the rollouts. Where that is
     #: less than all of its leaves, take `goals` of the tree: among those of branches the discriminator would choose.
     trees: Count = 1
-    #: Style of all agents that the agent drives, such as `headway=.8,speed=.3`: quantiles among the vehicles it
-    #: learned from; what is not given is drawn for each (agents trained with `agent.persona`).
-    persona: str = ""
     logged_goals: bool = False  # Give agents the routes of the log instead of sampled ones.
     #: Seconds of each run segment that are simulated; 0: as many as the agent was trained with.
     duration: Natural = 0
@@ -137,7 +119,6 @@ class EvaluateConfig(SimulationConfig):
             raise ConfigError(f"engine 'ray' works on CPUs only, device is '{self.device}'")
         if self.rollouts % self.trees:
             raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")
-        persona_quantiles(self.persona)
         if self.interactive != "all" and not 0 <= self.interactive <= MOST:
             raise ConfigError(f"interactive is 'all' or a number up to {MOST}, is {self.interactive}")
         for path in self.metric:

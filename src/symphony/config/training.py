@@ -152,7 +152,7 @@ class TrainConfig(RunConfig):
     def scenes(self) -> dict[str, Any]:
         """Which run segments are learned from and how they are drawn, as :class:`SceneDataset` takes it."""
         one = self.agent
-        return {"interactive": one.interactive, "duration": self.duration, "persona": one.persona}
+        return {"interactive": one.interactive, "duration": self.duration}
 
     def rates(self, optimizers: Iterable[str]) -> dict[str, float]:
         """Learning rates by network, before they fall."""

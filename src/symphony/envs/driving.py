@@ -51,7 +51,6 @@ class State(NamedTuple):
     goal: Tensor  # [*b, N] routes that agents follow, -1 for none
     progress: Tensor  # [*b, N] metres that they have come along them
     waiting: Tensor | None = None  # [*b, N] who has not entered yet; None where traffic is not open
-    persona: Tensor | None = None  # [*b, N, 2] driving styles; None where they are not observed
 
 
 class DrivingEnv(EnvBase):
@@ -172,8 +171,6 @@ class DrivingEnv(EnvBase):
         state["goal"] = numbers(n, dtype=torch.int64)
         if self.open_traffic:
             state["waiting"] = flags(n)
-        if self.observation.persona:
-            state["persona"] = numbers(n, 2)
         seen = observation_spec(self.observation, n, device)
         observed = {} if seen.is_empty() else {"observation": seen}
         outcome = {"collision": flags(n, 1), "offroad": flags(n, 1)}
@@ -215,7 +212,6 @@ class DrivingEnv(EnvBase):
         scene: Int[Tensor, "*b"],
         rollout: Int[Tensor, "*b"] | int = 0,
         goal: Int[Tensor, "*b N"] | None = None,
-        persona: Float[Tensor, "*b N 2"] | None = None,
     ) -> TensorDict:
         """State at the first logged step, as :meth:`reset` returns it.
 
@@ -224,7 +220,6 @@ class DrivingEnv(EnvBase):
             rollout: number of the rollout (branch, repetition) within its scene, so that each draws numbers of
                 its own whatever batch it runs in.
             goal: routes that agents follow; by default none.
-            persona: driving styles; by default those of the scenes.
         """
         rollout = torch.as_tensor(rollout, device=scene.device).expand(scene.shape)
         stream = fold_in(self.scenes.stream[scene], rollout)
@@ -234,11 +229,9 @@ class DrivingEnv(EnvBase):
         # Those that enter later begin where the log has them then.
         first = with_speed(self.scenes.log_state[row, enter, index])
         first = torch.cat([first[..., :3], first[..., 3:].clamp_min(0.0)], -1)
-        if self.observation.persona and persona is None:
-            persona = self.scenes.persona[row, index]
         begin, progress = torch.zeros_like(scene), torch.zeros_like(first[..., 0])
         none = torch.full_like(real, -1, dtype=torch.int64)
-        start = State(scene, begin, stream, first, real & early, none, progress, waiting, persona)
+        start = State(scene, begin, stream, first, real & early, none, progress, waiting)
         return self._from_state(start if goal is None else self._following(start, goal))
 
     def at(self, state: TensorDictBase) -> TensorDict:
@@ -351,8 +344,7 @@ class DrivingEnv(EnvBase):
             tensordict.get(k) for k in (keys.STATE, keys.VALID, keys.GOAL, keys.PROGRESS)
         )
         waiting = tensordict.get(keys.WAITING) if self.open_traffic else None
-        persona = tensordict.get(keys.PERSONA, None) if self.observation.persona else None
-        return State(scene, step, stream, state, valid, goal, progress, waiting, persona)
+        return State(scene, step, stream, state, valid, goal, progress, waiting)
 
     def _from_state(self, now: State) -> TensorDict:
         """Observation, flags and end of the episode, all functions of the simulation state."""
@@ -390,10 +382,6 @@ class DrivingEnv(EnvBase):
         agents |= {"collision": back(collision)[..., None], "offroad": back(offroad)[..., None]}
         if now.waiting is not None:
             agents["waiting"] = now.waiting
-        if self.observation.persona:
-            # A state that says nothing of it, such as one of the log, is of no style in particular.
-            none = now.state.new_zeros(*shape, self.num_agents, 2)
-            agents["persona"] = none if now.persona is None else now.persona
         if seen:
             agents["observation"] = nested({name: back(value) for name, value in seen.items()})
         rows = {"scene": now.scene, "step": now.step, "stream": now.stream}

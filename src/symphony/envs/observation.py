@@ -48,7 +48,6 @@ class ObservationConfig:
         turns: whether whoever chooses a route observes where routes turn and change lanes.
         along: whether it observes where the objects are along that route.
         gaps: whether it observes how far its box is from others.
-        persona: whether it knows the style in which it drives, a part of its state.
         clearance: whether it observes how far its box is from others and from the edge of the road.
         foresight: seconds ahead at which it also observes how far it would be from others, were everyone to keep
             speed and course; with ``gaps`` or ``clearance`` only.
@@ -65,7 +64,6 @@ class ObservationConfig:
     turns: bool = False
     along: bool = False
     gaps: bool = False
-    persona: bool = False
     clearance: bool = False
     foresight: tuple[float, ...] = ()
     own: bool = True

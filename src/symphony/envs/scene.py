@@ -146,7 +146,6 @@ class SceneBatch(TensorClass):
     log_valid: Tensor  # [T, A]
     box_size: Tensor  # [A, 2] length, width
     agent_type: Tensor  # [A] int64
-    persona: Tensor  # [A, 2] headway and speed among logged agents, from -1 to 1; 0 if not measured
     interactive: Tensor  # [N] int64 rows of A; 0 for padding
     interactive_valid: Tensor  # [N]
     enter: Tensor  # [N] int64 step at which the log brings an agent in; 0 for those there from the start
@@ -201,7 +200,6 @@ def scene(
     number: int = 0,
     edge: MapEdge | None = None,
     background: Sequence[bool] | NDArray[np.bool_] | None = None,
-    persona: NDArray[np.float32] | None = None,
 ) -> SceneBatch:
     """One run segment as a batch of one scene, without padding.
 
@@ -213,7 +211,6 @@ def scene(
         edge: of the map; with it the traffic is open: interactive agents enter where the log first has them within
             the map, and leave at its edge.
         background: [N] which of the interactive agents a rule drives; by default none.
-        persona: [A, 2] of all agents, see :class:`SceneBatch`.
 
     Raises:
         DataError: if the segment has fewer usable agents.
@@ -239,7 +236,6 @@ def scene(
         "log_valid": segment.valid.T,
         "box_size": segment.size[:, :2],
         "agent_type": segment.agent_type.astype(np.int64),
-        "persona": np.zeros((segment.num_agents, 2), np.float32) if persona is None else persona,
         "interactive": chosen,
         "interactive_valid": np.ones(len(chosen), bool),
         "enter": enter,

@@ -107,7 +107,7 @@ def evaluate(
     others = [load_agent(name, config.device) for name in BASELINES] if baselines else []
     everyone = [agent, *(other for other in others if other.name != agent.name)]
     # Baselines always do the same, and have no discriminator to search by.
-    once = dataclasses.replace(config, rollouts=1, trees=1, search="none", action_temperature=1.0, persona="")
+    once = dataclasses.replace(config, rollouts=1, trees=1, search="none", action_temperature=1.0)
     acting: int | Literal["all"] = "all" if config.interactive == "all" else dataset.interactive
     found = []
     for number, one in enumerate(everyone):

@@ -6,14 +6,13 @@ import os
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -29,9 +28,6 @@ from symphony.errors import DataError, DataWarning
 from symphony.geometry.frames import with_speed
 from symphony.learning.experts import Experts, KeptExperts, expert_batch, fit_experts, logged, logged_routes
 from symphony.roadgraph import LaneGraph
-
-if TYPE_CHECKING:
-    from symphony.learning.personas import PersonaScale
 
 T = TypeVar("T")
 
@@ -122,7 +118,6 @@ class SceneDataset:
         duration: seconds of each segment that are used; 0 for all.
         keep: segments held in memory once they are prepared; None for as many as there is room for (a quarter of the
             machine's memory; 170 kB each in the built-in data, with routes).
-        persona: whether the driving style of all agents is measured.
 
     Raises:
         DataError: on access, for a segment shorter than the duration.
@@ -138,13 +133,12 @@ class SceneDataset:
         routes: bool = False,
         duration: float = 0,
         keep: int | None = None,
-        persona: bool = False,
     ) -> None:
         self.store = store
         self.interactive = interactive
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
-        self.routes, self.duration, self.keep, self.persona = routes, duration, keep, persona
+        self.routes, self.duration, self.keep = routes, duration, keep
         self.scene = ItemCache(self._prepared, _nbytes, keep=keep, name="prepared run segments")
         self.experts = ItemCache(self._experts, attrgetter("nbytes"), keep=keep, name="demonstrations")
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
@@ -153,12 +147,7 @@ class SceneDataset:
         self._batch = lru_cache(1)(lambda items: collate(self.scene.many(items)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        how: Any = {
-            "routes": self.routes,
-            "duration": self.duration,
-            "keep": self.keep,
-            "persona": self.persona,
-        }
+        how: Any = {"routes": self.routes, "duration": self.duration, "keep": self.keep}
         return partial(SceneDataset, **how), (self.store, self.interactive, self.dynamics, self.indices)
 
     def __len__(self) -> int:
@@ -215,20 +204,7 @@ class SceneDataset:
     def _scene(self, i: int) -> SceneBatch:
         """Item ``i`` as a batch of one scene."""
         graph, segment = self.graph(i) if self.routes else None, self.segment(i)
-        persona = self.personas.personas(self._styles(i)) if self.persona else None
-        return scene(segment, self.interactive, graph, number=i, persona=persona)
-
-    @cached_property
-    def personas(self) -> PersonaScale:
-        """The driving styles of all items, measured when first asked for."""
-        from symphony.learning.personas import PersonaScale  # noqa: PLC0415 - few learn with them
-
-        return PersonaScale.of(map(self._styles, range(len(self))))
-
-    def _styles(self, i: int) -> NDArray[np.float64]:
-        from symphony.learning.personas import styles  # noqa: PLC0415
-
-        return styles(self.segment(i), self.graph(i))
+        return scene(segment, self.interactive, graph, number=i)
 
     def _prepared(self, items: Sequence[int]) -> list[SceneBatch]:
         return [self._scene(i) for i in items]
@@ -290,8 +266,7 @@ class SceneDataset:
 
             now, later = (with_speed(scenes.log_state[item, when + k, agent]) for k in (0, 1))
             size = scenes.box_size[item, agent]
-            ahead = perturbation.AHEAD_IN_STYLE if self.persona else perturbation.AHEAD
-            how = self.dynamics, self.dt, perturb.share, rng, ahead
+            how = self.dynamics, self.dt, perturb.share, rng
             state, action = perturbation.perturbed(state, action, now, later, size, *how)
         seen = None
         if observation.route:

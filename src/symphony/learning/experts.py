@@ -221,8 +221,6 @@ def expert_batch(
     batch = TensorDict({}, batch_size=[len(step)], device=state.device)
     batch.set(keys.VALID, real)
     batch.set(keys.STATE, here)
-    if observation.persona:
-        batch.set(keys.PERSONA, scenes.persona[scene_of, agent][:, None])
     for name, value in seen.items():
         batch.set(("agents", "observation", name), value)
     if action is not None:

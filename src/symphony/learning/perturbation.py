@@ -15,20 +15,16 @@ from symphony.geometry.frames import rotate, wrap
 
 ALONG, ACROSS = 1.5, 1.0
 """Seconds in which an error along and across the road dies out to a third or so."""
-AHEAD, AHEAD_IN_STYLE = 1.5, 8.0
-"""Standard deviations of displacements along the road in metres; the second is that of agents with personas, which
-have to see other headways than the one that a driver keeps in the log."""
-ASIDE, TURNED, FASTER = 0.5, 0.1, 1.5
-"""Standard deviations of displacements to the side in metres, in heading in radians and in speed in m/s."""
+AHEAD, ASIDE, TURNED, FASTER = 1.5, 0.5, 0.1, 1.5
+"""Standard deviations of displacements along the road and to the side in metres, in heading in radians and in speed
+in m/s."""
 SLOWEST = 2.0
 """m/s below which steering is not made harder, however slow the vehicle."""
 STEERING, BRAKING = 0.5, 4.0
 """Largest steering angle in radians and acceleration in m/s^2 of the way back."""
 
 
-def displaced(
-    logged: Float[Tensor, "M 4"], rng: torch.Generator, ahead: float = AHEAD
-) -> Float[Tensor, "M 4"]:
+def displaced(logged: Float[Tensor, "M 4"], rng: torch.Generator) -> Float[Tensor, "M 4"]:
     """States x, y, heading, speed near logged ones.
 
     Errors are normal, times a number drawn uniformly from 0 to 1 for each state. Slow vehicles are moved less across
@@ -38,7 +34,7 @@ def displaced(
     share = torch.rand(len(logged), generator=rng)
     speed = logged[:, 3].abs()
     slow = (speed / 4.0).clamp_max(1.0)
-    shift = torch.stack([normal[:, 0] * ahead, normal[:, 1] * ASIDE * slow], -1)
+    shift = torch.stack([normal[:, 0] * AHEAD, normal[:, 1] * ASIDE * slow], -1)
     turn = normal[:, 2] * TURNED * slow * (8.0 / speed.clamp_min(8.0))
     faster = normal[:, 3] * FASTER
     return torch.cat(
@@ -93,7 +89,6 @@ def perturbed(
     dt: float,
     share: float,
     rng: torch.Generator,
-    ahead: float = AHEAD,
 ) -> tuple[Float[Tensor, "M 4"], Tensor]:
     """Expert states and actions, a share of them displaced and labelled with the action that comes nearest to the way
     back.
@@ -108,10 +103,9 @@ def perturbed(
         dt: seconds per step.
         share: of the states that are displaced.
         rng: for all draws.
-        ahead: standard deviation of displacements along the road, metres.
     """
     chosen = (torch.rand(len(state), generator=rng) < share).nonzero()[:, 0]
-    moved, before, size = displaced(logged, rng, ahead)[chosen], logged[chosen], size[chosen]
+    moved, before, size = displaced(logged, rng)[chosen], logged[chosen], size[chosen]
     target = way_back(moved, before, following[chosen], size[:, 0], dt)
     label = dynamics.towards(moved, target, size, dt).to(action.dtype)
     return state.index_copy(0, chosen, moved), action.index_copy(0, chosen, label)

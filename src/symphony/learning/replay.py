@@ -22,7 +22,6 @@ _LEARNED = (
     keys.POINTS_MASK,
     keys.LIGHTS_MASK,
     keys.VALID,
-    keys.PERSONA,
     keys.ACTION,
     keys.ROLLOUT,
 )

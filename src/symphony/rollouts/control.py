@@ -1,4 +1,4 @@
-"""Changes that a user makes to agents: goals of single ones, their personas, and how bold their draws are."""
+"""Changes that a user makes to agents: goals of single ones, and how bold their draws are."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from numpy.typing import NDArray
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from symphony import keys
-from symphony.config.evaluation import PERSONA_PARTS, persona_quantiles
 from symphony.data.segment import RunSegment
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
@@ -30,22 +29,6 @@ def tempered(temperature: float) -> TensorDictModule:
         return inverse_cdf(logits / temperature, noise)
 
     return TensorDictModule(draw, [keys.LOGITS, keys.NOISE], [keys.ACTION])
-
-
-def given_personas(personas: Float[Tensor, "M 2"] | None, asked: str) -> Float[Tensor, "M 2"] | None:
-    """Personas to draw from, with the quantiles of headway and speed that are asked for in place of their own.
-
-    Raises:
-        ConfigError: for an agent without personas.
-    """
-    if not asked:
-        return personas
-    if personas is None:
-        raise ConfigError("--persona means nothing to this agent, trained without personas (agent.persona)")
-    found = personas.clone()
-    for name, quantile in persona_quantiles(asked).items():
-        found[:, PERSONA_PARTS.index(name)] = 2 * quantile - 1
-    return found
 
 
 def given_goals(

@@ -26,7 +26,7 @@ from symphony.metrics import collisions
 from symphony.modules import SeededNoise
 from symphony.planners.driver import EgoPlanners, EgoPolicy, PlannedEnv, RuledEgo, ego_policy
 from symphony.rollouts.background import CarFollower, constant_speed
-from symphony.rollouts.control import given_personas, tempered
+from symphony.rollouts.control import tempered
 from symphony.rollouts.search import going_back, pruning_rule, search
 from symphony.rollouts.unroll import (
     NaNGuard,
@@ -119,7 +119,6 @@ def simulation(
         seed=config.seed,
         logged_goals=config.logged_goals,
         goals_per=settings.goals,
-        personas=given_personas(agent.personas, config.persona),
         fix=fixed,
     )
     planned = None

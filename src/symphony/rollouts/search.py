@@ -47,7 +47,6 @@ _KEPT = (
 
 def _settings(env: DrivingEnv, rule: PruningRule | Backtrack, also: Sequence[Any] = ()) -> dict[str, Any]:
     """Settings that every search of driving gives the collector."""
-    persona = [keys.PERSONA] if env.observation.persona else []
     waiting = [keys.WAITING] if env.open_traffic else []
     return {
         "aggregate": max_then_sum,
@@ -55,7 +54,7 @@ def _settings(env: DrivingEnv, rule: PruningRule | Backtrack, also: Sequence[Any
         "slot_keys": (keys.STREAM,),
         "group_key": keys.GOAL if takes_groups(rule) else None,
         # Of every step enough to observe its states anew.
-        "keep": [*_KEPT, *persona, *waiting, *also],
+        "keep": [*_KEPT, *waiting, *also],
     }
 
 

@@ -110,34 +110,28 @@ def start_states(
     seed: int,
     logged_goals: bool = False,
     goals_per: Literal["tree", "branch"] = "tree",
-    personas: Float[Tensor, "M 2"] | None = None,
     fix: Callable[[Tensor, Tensor], Tensor] = lambda scene, goal: goal,
 ) -> TensorDictBase:
-    """First states [B, trees, branches] of all scenes, observed once they have their goals and personas.
+    """First states [B, trees, branches] of all scenes, observed once they have their goals.
 
-    Goals are drawn by the goal policy, if there is one, or those nearest to the log; personas from M equally likely
-    ones: once for all branches of a tree (paper, section IV-B), or for each branch alone. ``fix`` gives the goals
-    that agents follow, from rows of the scenes [*b] and these goals [*b, N].
+    Goals are drawn by the goal policy, if there is one, or those nearest to the log: once for all branches of a tree
+    (paper, section IV-B), or for each branch alone. ``fix`` gives the goals that agents follow, from rows of the
+    scenes [*b] and these goals [*b, N].
     """
     device, shape = env.scenes.device, (len(env.scenes), trees, branches)
     scene = torch.arange(len(env.scenes), device=device)[:, None, None].expand(shape)
     number = torch.arange(trees * branches, device=device).reshape(trees, branches).expand(shape)
-    goal, persona = torch.full((*shape, env.num_agents), -1, device=device), None
-    if personas is not None:
-        first = number if goals_per == "branch" else number[..., :1].expand(shape)
-        share = _drawn(env, scene[..., None], seed, Stream.PERSONAS, first)
-        persona = personas[(share * len(personas)).long()]
+    goal = torch.full((*shape, env.num_agents), -1, device=device)
     if goals is not None and logged_goals:
         goal = env.scenes.route_logged[scene]
     elif goals is not None and goals_per == "branch":
-        goal = draw_goals(env, goals, env.start(scene, number, persona=persona), seed, number)
+        goal = draw_goals(env, goals, env.start(scene, number), seed, number)
     elif goals is not None:
         # Chosen once, by what the first branch of each tree observes.
-        styles = None if persona is None else persona[:, :, 0]
         tree = torch.arange(trees, device=device).expand(shape[:2])
-        drawn = draw_goals(env, goals, env.start(scene[..., 0], number[..., 0], persona=styles), seed, tree)
+        drawn = draw_goals(env, goals, env.start(scene[..., 0], number[..., 0]), seed, tree)
         goal = drawn[:, :, None].expand(*shape, -1)
-    return env.start(scene, number, fix(scene, goal), persona)
+    return env.start(scene, number, fix(scene, goal))
 
 
 def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDictBase) -> Rollouts:

@@ -34,7 +34,7 @@ from symphony.agents.checkpoint import (
     save_checkpoint,
 )
 from symphony.agents.choice import Best, choose, split_name
-from symphony.config import AgentSpec, RunConfig, read_json, to_json
+from symphony.config import RunConfig, read_json, to_json
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.files import Lock, write_file
 from symphony.training.logging import RECORDS, Tracker
@@ -215,8 +215,6 @@ class Trainer:
         self.done = checkpoint_to_resume(config)
         if config.warm_start is not None and self.done is None:
             warm_start(agent, config.warm_start)
-        if agent.personas is not None and self.done is None:
-            agent.personas.copy_(data.personas.table())
 
     def run(self) -> Path:
         """Train to the end.
@@ -445,7 +443,7 @@ def _changed(before: Any, after: Any, where: str = "") -> list[str]:
 
 
 def warm_start(agent: Agent, run: Path) -> None:
-    """Take over the networks that another run has too; personas that they had not change nothing at first.
+    """Take over the networks that another run has too.
 
     Raises ConfigError if there is no such run, or it learned another time step, and CheckpointError if its networks
     have other shapes, with the settings of the agent that differ.
@@ -457,20 +455,10 @@ def warm_start(agent: Agent, run: Path) -> None:
     before = read_spec(folder)
     if agent.spec is not None:
         dataclasses.replace(agent, name=str(run), spec=before).check_step(agent.spec.dt)
-    widen = agent.spec is not None and _only_personas(before, agent.spec)
     try:
-        load_checkpoint(source, modules=shared, partial=True, restore_rng=False, widen=widen)
+        load_checkpoint(source, modules=shared, partial=True, restore_rng=False)
     except CheckpointError as error:
         changed = [] if agent.spec is None else _changed(before.agent, agent.spec.agent, "agent.")
         if changed:
             error.message += f"; its agent has another {', '.join(changed)}"
         raise
-
-
-def _only_personas(before: AgentSpec, after: AgentSpec) -> bool:
-    """Whether personas are all that is new to the networks, and come after all that they knew: any other input would
-    stand before inputs that are learned already, whose weights it would get.
-    """
-    told = dataclasses.replace(before.agent, persona=True, interactive=after.agent.interactive)
-    alike = told == after.agent and before.goals == after.goals and before.action_space == after.action_space
-    return alike and not before.agent.persona and after.agent.features != "road"
