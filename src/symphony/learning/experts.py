@@ -293,6 +293,6 @@ class KeptExperts:
                     part = io.BytesIO()
                     np.save(part, array)
                     # Of no date, so that equal arrays are equal files.
-                    file.writestr(zipfile.ZipInfo(f"{name}.npy"), part.getvalue())
+                    file.writestr(zipfile.ZipInfo(f"{name}.npy"), part.getvalue(), zipfile.ZIP_DEFLATED, 1)
         except OSError:
             self.folder = None
