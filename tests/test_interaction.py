@@ -70,6 +70,19 @@ def test_egos(tmp_path: Path) -> None:
     assert "no moving vehicle is observed at every step" in nobody.message
 
 
+def test_an_ego_may_enter_late_and_leave_early(tmp_path: Path) -> None:
+    late, early = track(3, steps=range(30, 120)), track(5, y=6, steps=range(60))
+    parked = track(9, x=60, speed=0)
+    (segment,) = segments(public(tmp_path, [*late, *early, *parked]))
+    assert (segment.segment_id, segment.num_steps) == ("DR_X_000_t0", 71)
+    assert segment.agent_id[segment.ego] == 3
+    np.testing.assert_allclose(
+        segment.position[segment.ego, :, 0] + segment.origin[0], np.arange(30, 101), atol=1e-4
+    )
+    short = public(tmp_path, [*track(3, steps=range(55, 120)), *parked])
+    assert "no moving vehicle is observed at every step" in read_error("interaction", short).message
+
+
 def cases(folder: Path, place: str, rows: list[str]) -> Path:
     path = folder / f"{place}_train.csv"
     path.write_text(text(rows, f"case_id,{COLUMNS},track_to_predict,interesting_agent"))
@@ -248,7 +261,7 @@ def test_samples(samples: Path) -> None:
     assert "two states" in read_error("interaction", folder / "k733_2018-05-02" / lit.name).message
     reader = get_reader("interaction", window=5, motion="positions")
     found = [item for item in reader.read(lit) if isinstance(item, RunSegment)]
-    assert len(found) == 28
+    assert len(found) == 30
     # Of the cars that drive over a stop line, none does so at red.
     assert crossings(found) == {SignalState.GO: 25, SignalState.CAUTION: 2}
     clean = check_reader(get_reader("interaction"), [folder / "k729_2022-03-16" / "vehicle_tracks_011.csv"])

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.resample import MAX_GAP, evened
-from symphony.data.segment import Bools, Floats, RoadMap, RunSegment, SignalState, check_counts
+from symphony.data.segment import AgentType, Bools, Floats, RoadMap, RunSegment, SignalState, check_counts
 from symphony.data.sources import base, lanelet2, lines
 from symphony.data.sources import interaction_tracks as tracks
 from symphony.data.sources.base import Doubles, Item, Reader, check_choice, located, read_whole, refuse
@@ -78,7 +78,8 @@ class InteractionReader(Reader):
     Args:
         egos: ``"one"`` picks an ego per window, ``"all"`` gives a segment for each vehicle that moves and is seen at
             every step, as in :class:`~symphony.data.sources.commonroad.CommonRoadReader`.
-        window: seconds of a segment. The rest of a recording counts if it is at least half as long.
+        window: seconds of a segment. The rest of a recording counts if it is at least half as long; so does the
+            time for which a vehicle is seen, where none is seen throughout a window.
         stride: seconds between the starts of windows; by default ``window``, so that they don't overlap.
         motion: ``"logged"`` takes velocities and headings as they are, and refuses a file where they are not those of
             its positions; ``"positions"`` computes velocities, replaces headings that are far off the motion, and
@@ -132,12 +133,13 @@ class InteractionReader(Reader):
             first = int(mine.time[0])
             steps = int(mine.time[-1]) - first + 1
             refuse(steps > MAX_STEPS, f"{steps} steps, at most {MAX_STEPS} can be read", "timestamp_ms")
-            for begin, stop in self._windows(steps, dt) if files.single else [(0, steps)]:
-                part = mine.take(slice(*np.searchsorted(mine.time, [first + begin, first + stop])))
-                what = f"t{round(begin * dt, 3):g}" if files.single else f"case{case}"
+            for at, end in self._windows(steps, dt) if files.single else [(0, steps)]:
+                window = first + at, first + end
+                what = f"t{round(at * dt, 3):g}" if files.single else f"case{case}"
                 name = f"{files.map.stem}_{files.part}_{what}"
+                begin, stop = _observed(mine.between(*window), *window) if files.single else window
                 try:
-                    yield from self._window(part, scene, name, first + begin, stop - begin)
+                    yield from self._window(mine.between(begin, stop), scene, name, begin, stop - begin)
                 except DataError as error:
                     yield error.at(segment=name)
 
@@ -191,6 +193,23 @@ class InteractionReader(Reader):
         )
         segment = evened(segment, there.astype(np.float64) * scene.dt)
         yield from base.by_ego(segment, candidates, self.egos)
+
+
+def _observed(rows: Rows, begin: int, stop: int) -> tuple[int, int]:
+    """Return the window itself, or where no vehicle that moves is seen throughout, the longest time for which one is,
+    if that is at least half of the window.
+    """
+    times, step = np.unique(rows.time, return_inverse=True)  # at others the frame may be lost
+    best = times[:0]
+    for track in np.unique(rows.track[rows.kind == AgentType.VEHICLE]):
+        mine = np.flatnonzero(rows.track == track)
+        for part in np.split(mine, np.flatnonzero(np.diff(step[mine]) != 1) + 1):
+            moves = (
+                np.linalg.norm(rows.state[part, :2] - rows.state[part[0], :2], axis=-1).max() > base.MOVING
+            )
+            best = times[step[part]] if moves and len(part) > len(best) else best
+    whole = len(best) == len(times) or not len(best) or 2 * (best[-1] - best[0]) < stop - begin - 1
+    return (begin, stop) if whole else (int(best[0]), int(best[-1]) + 1)
 
 
 def _lost(valid: Bools, dt: float) -> Bools:

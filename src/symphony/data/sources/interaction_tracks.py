@@ -58,6 +58,10 @@ class Rows:
         """Return some of the rows."""
         return Rows(*(array[where] for array in vars(self).values()))
 
+    def between(self, begin: int, stop: int) -> Rows:
+        """Return the rows of some steps of one case."""
+        return self.take(slice(*np.searchsorted(self.time, [begin, stop])))
+
 
 def read_rows(path: Path) -> Rows:
     """Read a track file.
