@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import tyro
@@ -24,8 +24,10 @@ from helpers_segments import crossing, straight_road
 from helpers_store import fill
 from symphony import __version__
 from symphony.agents import Agent, discriminator_network, goal_network, policy_network
+from symphony.bench.measures import MEASURES
 from symphony.cli import GONE, main
 from symphony.cli.data import Info
+from symphony.cli.planners import Rate
 from symphony.cli.recipe import Arguments
 from symphony.cli.shared import print_table
 from symphony.config import METHODS, TrainConfig
@@ -82,9 +84,43 @@ def test_what_users_type_changes_on_purpose_only() -> None:
 
 @pytest.mark.parametrize("gone", GONE)
 def test_what_is_gone_is_told_with_what_takes_its_place(gone: str, capsys: Any) -> None:
-    assert main([*gone.split(), "x"]) == 2
-    assert f"`symphony {gone}` is gone: {GONE[gone]}" in capsys.readouterr().err
+    command, _, option = gone.partition(" --")
+    name, _, value = option.partition(" ")
+    underscores = [f"--{name.replace('-', '_')}"] * bool(name)
+    joined = [f"--{option.replace(' ', '=')}" if value else f"--{name}=x"] * bool(name)
+    for typed in ([*gone.split(), "x"], [*command.split(), *underscores, value], [*command.split(), *joined]):
+        assert main(typed) == 2
+        assert f"`symphony {gone}` is gone: {GONE[gone]}" in capsys.readouterr().err
     assert not any(line.startswith(gone) for line in LINES)
+
+
+def test_a_folder_may_be_called_as_what_is_gone(capsys: Any) -> None:
+    assert main(["plot", "curves", "tree", "--out", "a.png"]) == 1
+    assert "tree" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("args", "told"), [
+    ("plot curves --out a.png", "give at least 1 RUN ..."),
+    ("table --setting main --runs", "give at least 1 --runs"),
+    ("data info x --interactive -1", "--interactive must not be negative, is -1"),
+    ("hunt x --planner idm --data y --out z --trees 1", "--trees must be at least 4, is 1"),
+    ("plot curves x --out a.png --window 2", "--window must be at most 1, is 2.0"),
+    ("data convert womd x --out y --rate nan", "--rate must be a number, is nan"),
+    ("data generate --out y --count 1 --kinds random", "(known: town, grid, ramp, and files of roads"),
+])  # fmt: skip
+def test_bounds_are_told_as_they_are_typed(args: str, told: str, capsys: Any) -> None:
+    assert main(args.split()) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_what_is_required_shows_no_default() -> None:
+    for command in (("plot", "curves"), ("data", "merge"), ("table",), ("planners",), ("wosac", "table")):
+        assert re.search(r"\.\.\. +[A-Z][^()]*(\([^()]*\)[^()]*)?\(required\)", help_of(*command)), command
+
+
+def test_rates_that_are_hunted_are_those_of_a_suite() -> None:
+    rates = [name for name, measure in MEASURES.items() if measure.kind == "rate"]
+    assert list(get_args(Rate)) == rates
 
 
 def test_installed_command_prints_the_version() -> None:
@@ -105,7 +141,12 @@ data convert womd --out y
 data convert womd x --out y --egos all
 data convert womd x --out y --window 4
 data generate --out y
+data convert womd x --out y --rate nan
+data convert womd x --out y --interactive -3
+data convert womd x --out y --radius nan
+data convert interaction x --out y --stride 0
 data generate --out y --preset town --seed 1
+data generate --out y --count 1 --kinds random
 train bc --data x --out y --steps many
 train bc --data x --out y --steps 0
 evaluate --data x
@@ -113,7 +154,16 @@ evaluate playback --data x --unknown 1
 plot curves --out a.png
 plot curvature --out a.png
 table --setting main
+table --setting main --runs
 table --setting short --runs x
+plot curves x --out a.png --window nan
+plot curves x --out a.png --window 1.1
+hunt x --planner idm --data y --out z --metric nonsense
+hunt x --planner idm --data y --out z --trees 1
+demo --steps -1
+simulate playback --data x --out y --threshold nan
+simulate playback --data x --out y --planner-seconds nan
+simulate playback --data x --out y --runs -1
 plot segment x --segment 0 --out a.png --interactive 0
 simulate playback --data x --out y --runs 5 --segments a
 simulate playback --data x --out y --runs 5 --rollouts 2

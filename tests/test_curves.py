@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from symphony.cli import main
+from symphony.evaluation import records as records_module
 from symphony.render import plot_curves
 from symphony.render.curves import read_curves, smoothed
 from symphony.render.style import AGENT_COLORS
@@ -82,8 +83,29 @@ def test_the_command_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["plot", "curves", one, two, "--out", out, "--metrics", "auc", "accuracy"]) == 0
     assert Path(out).stat().st_size > 5_000
     for words, expected in (
-        ([fresh], "no metrics to draw"), ([one, "--metrics", "auk"], "no run has auk"),
-        ([one, "--window", "2"], "from 0 to 1"), ([one, "--out", "a.txt"], ".png"),
+        ([one, fresh], f"{fresh}: is no run"), ([str(tmp_path)], f"{tmp_path}: is no run"),
+        ([one, "--metrics", "auk"], "no run has auk"), ([one, "--out", "a.txt"], ".png"),
     ):  # fmt: skip
         assert main(["plot", "curves", "--out", out, *words]) == 1
         assert expected in capsys.readouterr().err
+    for command in ("curves", "curvature"):
+        assert main(["plot", command, one, two, f"{one}/", "--out", out]) == 2
+        assert f"RUN ...: {one} is given twice" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("damage", [
+    {"policy": None}, {"log": [1, 2]}, {"log": [1.5, 2.0, 3.0]}, {"policy": [-1, 2, 3]}, {"policy": [1 << 70, 2, 3]},
+])  # fmt: skip
+def test_a_damaged_evaluation_is_named(tmp_path: Path, damage: Any, capsys: Any) -> None:
+    record = {"format": 2, "run": {"updates": 1, "checkpoint": 1, "named": False}, "playback": {}}
+    record |= {"data": {"name": "a", "checksum": "b"}, "cost": {"simulation": 1}, "constant_velocity": {}}
+    parts = records_module._PARTS["config"]
+    record |= {"config": dict.fromkeys(parts, 0), "curvature": {"policy": [1, 2, 3], "log": [3, 2, 1]}}
+    folder = tmp_path / "run"
+    (folder / "evaluations").mkdir(parents=True)
+    (folder / "config.json").write_text('{"method": "bc"}')
+    command = ["plot", "curvature", str(folder), "--out", str(tmp_path / "a.png")]
+    for status, held in ((0, record), (1, {**record, "curvature": {**record["curvature"], **damage}})):
+        (folder / "evaluations" / "one.json").write_text(json.dumps(held))
+        assert main(command) == status, capsys.readouterr().err
+    assert f"file {folder}, field curvature: an evaluation holds no counts" in capsys.readouterr().err

@@ -170,6 +170,22 @@ def test_a_setting_that_is_gone_is_read_where_it_said_what_holds_now(store, tmp_
         read_json(AgentSpec, file)
 
 
+@pytest.mark.parametrize(("part", "change", "expected"), [
+    ("agent", {"hidden": None, "head": 128}, "agent.hidden must be int"),
+    ("agent", {"hidden": 10**30}, "agent.hidden must be at most"),
+    ("agent", {"interactive": 10**30}, "agent.interactive must be at most"),
+    ("", {"dt": 10**400}, "dt must be float"),
+    ("search", {"threshold": float("nan")}, "search.threshold must be a number, is nan"),
+])  # fmt: skip
+def test_a_damaged_agent_is_named(store, tmp_path, part, change, expected):
+    saved = json.loads(to_json(build(tiny("bc_ts", store, tmp_path / "run")).agent.spec))
+    (saved[part] if part else saved).update(change)
+    file = tmp_path / "agent.json"
+    file.write_text(json.dumps(saved))
+    with pytest.raises(ConfigError, match=rf"agent\.json: {expected}"):
+        read_json(AgentSpec, file)
+
+
 def test_names_that_are_unknown_are_refused(store: Path, tmp_path: Path) -> None:
     good, file = json.loads(to_json(tiny("bc_ts", store, tmp_path))), tmp_path / "config.json"
     changes: list[dict[str, Any]] = [{"format": 1}, {"serach": {}}, {"method": "mgail_bc"}]

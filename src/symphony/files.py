@@ -96,14 +96,15 @@ def finite(value: Any) -> Any:
 class Lock(AbstractContextManager["Lock"]):
     """Keeps other writers, who are told of it, out of a folder or a file until it is closed or this process ends.
 
-    The file at ``path``, removed in the end, stands for the ``output``, by default its folder, which errors name.
+    The file at ``path``, removed in the end, stands for the ``output``, by default its folder, which is made.
     """
 
     def __init__(self, path: Path, output: Path | None = None) -> None:
         self.path, self.output = path, output or path.parent
         program = Path(sys.argv[0]).name.replace("__main__.py", "symphony")
         who = f"{os.getpid()} on {socket.gethostname()}: {' '.join([program, *sys.argv[1:2]])}"
-        with naming(path):
+        with naming(self.output):
+            path.parent.mkdir(parents=True, exist_ok=True)
             while not _is_at(file := self._taken(), path):  # who had it has removed it meanwhile
                 os.close(file)
             os.ftruncate(file, 0)
@@ -136,8 +137,7 @@ def _is_at(file: int, path: Path) -> bool:
 
 
 def _release(path: Path, file: int, process: int) -> None:
-    # A copy of the process that took it has no say.
-    if os.getpid() == process and _is_at(file, path):
+    if os.getpid() == process and _is_at(file, path):  # a copy of the process that took it has no say
         path.unlink(missing_ok=True)
     os.close(file)
 

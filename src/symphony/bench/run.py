@@ -146,7 +146,6 @@ def run_suite(suite: Suite, out: Path, progress: Progress = None, *, view: bool 
         SymphonyError: it could not run; names what stands in the way.
     """
     began = time.perf_counter()
-    out.mkdir(parents=True, exist_ok=True)
     with Lock(out / "suite.lock"):
         base = _earlier(suite)
         pairs = []

@@ -13,13 +13,13 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, get_args
 
 import tyro
 
 from symphony import __version__, allocator, errors
 from symphony.cli.shared import Command, Result, tell
-from symphony.config.checks import Bounds, type_hints
+from symphony.config.checks import check, type_hints
 from symphony.config.profiles import expanded
 from symphony.files import lock_file
 
@@ -40,6 +40,8 @@ GONE = {
     "table --relations": "`python benchmarks/relations.py RUN ...` of a checkout prints them",
     "table --paired": "`python benchmarks/relations.py RUN ... --paired METHOD` of a checkout prints them",
     "table --each": "a method that was simulated in several ways has a row for each",
+    "table --format text": "`--format markdown`, as is the default, reads as text, too",
+    "table --format latex": "`--format json` has the numbers, and pandoc turns Markdown into LaTeX",
     "table --columns": "`symphony evaluate RUN --data DIR --details` prints these numbers",
     **dict.fromkeys(
         ("train --agent.persona", "evaluate --persona", "simulate --persona"),
@@ -48,6 +50,7 @@ GONE = {
     "simulate --agents": "the agent is named without an option: `symphony simulate RUN --data DIR --out SIM`",
 }
 """Commands and options that are gone, and what takes their place."""
+POSITIONAL = get_args(tyro.conf.Positional[int])[1]
 
 DESCRIPTION = """Realistic and diverse traffic agents learned from logged driving.
 
@@ -78,22 +81,19 @@ def main(args: Sequence[str] | None = None) -> int:
     if args == ["--version"]:
         return guarded(lambda: print(f"symphony {__version__}"))  # noqa: T201
     try:
-        for gone, instead in GONE.items():
-            *command, last = gone.split()
-            if args[: len(command)] == command and last in args:
-                raise errors.ConfigError(f"`symphony {gone}` is gone: {instead}")
+        _refuse_gone(args)
         chosen = app.cli(
             prog="symphony",
             description=DESCRIPTION,
             args=expanded(args) if args[:1] == ["train"] else args,
             config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
         )
-        hints = type_hints(chosen.__class__).items()
-        marks = {name: getattr(hint, "__metadata__", ()) for name, hint in hints}
-        marked = [(name, getattr(chosen, name), mark) for name in marks for mark in marks[name]]
-        for name, value, mark in marked:
-            if isinstance(mark, Bounds) and (len(value) if isinstance(value, tuple) else value) < mark.least:
-                raise errors.ConfigError(f"--{name.replace('_', '-')}: give at least {mark.least}")
+        results: list[Any] = []
+        for name, hint in type_hints(chosen.__class__).items():
+            marks, value = getattr(hint, "__metadata__", ()), getattr(chosen, name)
+            shown = filter(None, (getattr(mark, "metavar", None) for mark in marks if POSITIONAL in marks))
+            check(next(shown, f"--{name.replace('_', '-')}"), value, hint)
+            results += [value for mark in marks if isinstance(mark, Result) and str(value or "-") != "-"]
     except errors.ConfigError as error:
         return _complain(error, USAGE)
     except SystemExit as stop:
@@ -102,12 +102,23 @@ def main(args: Sequence[str] | None = None) -> int:
 
     def run() -> None:
         with contextlib.ExitStack() as held:
-            for _, path, mark in marked:  # tried and locked before the work
-                if isinstance(mark, Result) and path is not None and str(path) != "-":
-                    held.enter_context(lock_file(path))
+            for path in results:  # tried and locked before the work
+                held.enter_context(lock_file(path))
             chosen()
 
     return guarded(run)
+
+
+def _refuse_gone(args: Sequence[str]) -> None:
+    """Raise ConfigError for commands and options that are gone, however they are spelt."""
+    pairs = (word.replace("_", "-").split("=", 1) if word.startswith("--") else [word] for word in args)
+    words = [part for pair in pairs for part in pair]
+    for gone, instead in GONE.items():
+        command = gone.partition(" --")[0].split()
+        option, begin = gone.split()[len(command) :], len(command)
+        rest = (words[k : k + len(option)] for k in range(begin, len(words) + 1))
+        if words[:begin] == command and option in rest:
+            raise errors.ConfigError(f"`symphony {gone}` is gone: {instead}")
 
 
 def settle() -> None:

@@ -17,6 +17,7 @@ import symphony
 from symphony import files, render
 from symphony.cli import shared
 from symphony.config import AgentConfig, PaperData, PerturbConfig, Setting, TableFormat, WosacSettings
+from symphony.config.checks import Count
 from symphony.config.profiles import WORDS, Profile
 
 PANELS, SHOWN, NAMED = 6, 8, 5
@@ -34,25 +35,18 @@ class Train(shared.Command):
     profile: Annotated[Profile, arg(help=WORDS)] = "default"
 
     def __call__(self) -> None:
-        folder = symphony.train(self.config)
-        if os.environ.get("RANK", "0") == "0":  # of the processes that torchrun starts, one speaks
-            shared.say("\n".join(last_words(folder, self.config)))
+        from symphony.agents.choice import best_of, choose
 
-
-def last_words(folder: Path, config: symphony.TrainConfig) -> list[str]:
-    """Which checkpoint of a run is its agent and how good it is, and what to do next."""
-    from symphony.agents.choice import best_of, choose
-
-    score = "the last one; nothing was validated, see --validation.data"
-    if (best := best_of(choose(folder, "last"))) is not None:
-        data = f"segments of {config.validation.data} (at most {config.validation.segments})"
-        score = f"the best one, with collision rate plus off-road time of {best.infractions:.2f} % on {data}"
-    return [
-        f"trained agent  {folder}",
-        f"checkpoint     {choose(folder).name}: {score}",
-        f"curves         symphony plot curves {folder} --out curves.png",
-        f"evaluate it    symphony evaluate {folder} --data DIR",
-    ]
+        folder, validation = symphony.train(self.config), self.config.validation
+        if os.environ.get("RANK", "0") != "0":  # of the processes that torchrun starts, one speaks
+            return
+        score = "the last one; nothing was validated, see --validation.data"
+        if (best := best_of(choose(folder, "last"))) is not None:
+            score = f"the best one, with collision rate plus off-road time of {best.infractions:.2f} % on "
+            score += f"segments of {validation.data} (at most {validation.segments})"
+        shared.say(f"trained agent  {folder}\ncheckpoint     {choose(folder).name}: {score}")
+        shared.say(f"curves         symphony plot curves {folder} --out curves.png")
+        shared.say(f"evaluate it    symphony evaluate {folder} --data DIR")
 
 
 class Evaluate(shared.Simulation):
@@ -65,8 +59,7 @@ class Evaluate(shared.Simulation):
 
     json: shared.Json = None
     figure: shared.ResultFile = None  # Picture (.png, .pdf or .svg) or animation (.gif) of some rollouts.
-    #: Folder for the rollouts that are evaluated (see `symphony view`, `report` and `export`).
-    save_rollouts: shared.Folder = None
+    save_rollouts: shared.Folder = None  # Folder for the rollouts that are evaluated (see `symphony view`).
     #: Print every number of each agent, not only the table: kinds of collision, what the divergence owes to sampling,
     #: where agents stand at the end, what a search made of the goals, and what becomes of single agents.
     details: bool = False
@@ -134,11 +127,11 @@ class Table(shared.Command):
     the best of the BC methods and of the MGAIL methods in bold. Runs of other settings are left out.
     """
 
-    #: Setting of the table. `main`: 10 s, 2 interactive agents; `long`: 20 s; `many`: 8 interactive agents.
+    #: Setting of the table. `main`: 10 s, 2 interactive agents; `long`: 20 s, 2 agents; `many`: 10 s, 8 agents.
     setting: Setting
-    runs: Annotated[shared.Paths, arg(metavar="DIR ...")] = ()  # Folders of runs, or folders that hold some.
-    #: Names of the evaluations of a run that count, where it keeps several (in its folder `evaluations`); * and ?
-    #: stand for anything. Of several names, the first that fits any decides.
+    runs: Annotated[shared.Paths, arg(metavar="DIR ...")]  # Folders of runs, or folders that hold some.
+    #: Names of evaluations, for runs that keep several in their folder `evaluations`; * and ? stand for anything. Of
+    #: several names, the first that fits one decides.
     evaluation: shared.Names = ()
     paper: PaperData | None = None  # Data set on which the paper's own figures are shown beside ours.
     format: TableFormat = "markdown"  # Format of the table.
@@ -177,14 +170,13 @@ class Demo(shared.Command):
     Then learn another from the built-in data, some minutes, and show it beside the first.
     """
 
-    #: Folder for the trained agent, the pictures and the numbers; an earlier demo there is replaced.
-    out: Path = Path("out/demo")
-    steps: int = 1500  # Updates of the agent that is learned.
-    rollouts: int = 16  # Rollouts per run segment in the evaluation.
+    out: Path = Path("out/demo")  # Folder for agent, pictures, numbers; an earlier demo there is replaced.
+    steps: Count = 1500  # Updates of the agent that is learned.
+    rollouts: Count = 16  # Rollouts per run segment in the evaluation.
     seed: int = 0  # Seed of the training and of the rollouts.
 
     def __call__(self) -> None:
-        with shared.locked_folder(self.out, "demo.lock"):
+        with files.Lock(self.out / "demo.lock"):
             self._show_all()
 
     def _show_all(self) -> None:

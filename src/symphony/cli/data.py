@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,7 +12,7 @@ from tyro.conf import Positional, arg
 
 import symphony
 from symphony.cli import shared
-from symphony.config.checks import Count, Natural
+from symphony.config.checks import Bounds, Count, Natural, NotNegative, Positive
 from symphony.errors import ConfigError
 
 READER_OPTIONS = {"interaction": ("egos", "window", "stride", "motion"), "commonroad": ("egos",)}
@@ -28,7 +29,7 @@ class Generate(shared.Command):
     """
 
     out: Path  # Folder of the store; with a preset, of its stores `train`, `validation` and `test`.
-    count: int | None = None  # Number of run segments; needed unless a preset says it.
+    count: Annotated[int | None, Bounds(1)] = None  # Number of run segments; needed unless a preset says it.
     #: Standard set to make: 2 000 + 200 + 500 run segments, or 10 000 + 200 + 1 000, of 10 s.
     preset: Literal["town-small", "town"] | None = None
     seed: int = 0  # Seed of the networks: another one gives other networks.
@@ -138,9 +139,8 @@ class Hardest(shared.Command):
 class Convert(shared.Command):
     """Convert logs into a store of run segments.
 
-    A record that can't be used is skipped, counted and reported. The store appears once everything is converted;
-    until then the work lies in OUT.partial. A conversion that was interrupted or killed goes on where it stopped when
-    the same command is given again.
+    A record that can't be used is skipped, counted and reported. Until everything is converted, the work lies in
+    OUT.partial; a conversion that was interrupted or killed is continued by the same command.
     """
 
     #: Format of the logs: Waymo Open Motion Dataset (TFRecord), CommonRoad (XML), Argoverse 2 motion
@@ -149,19 +149,19 @@ class Convert(shared.Command):
     #: Files of that format, or folders to search for them.
     files: Annotated[Positional[shared.Paths], arg(metavar="FILE ...")]
     out: Path  # Folder of the store.
-    rate: float = 5.0  # Steps per second in the store (the paper's 5).
-    interactive: int = 2  # Interactive agents a run segment must have at its first step.
-    smooth: float = 0.0  # Smoothing of the tracks before they are resampled: sigma in seconds, 0 for none.
+    rate: Positive = 5.0  # Steps per second in the store (the paper's 5).
+    interactive: Count = 2  # Interactive agents a run segment must have at its first step.
+    smooth: NotNegative = 0.0  # Smoothing of the tracks before they are resampled: its sigma in seconds.
     #: Egos of each scenario of CommonRoad or window of INTERACTION, which name none: `one`, that with the most moving
     #: vehicles around it, or `all` moving vehicles seen throughout, with a run segment each.
     egos: Literal["one", "all"] = "one"
-    window: float = 10.0  # Seconds of the run segments that recordings of INTERACTION are cut into.
+    window: Positive = 10.0  # Seconds of the run segments that recordings of INTERACTION are cut into.
     #: Seconds between the starts of two windows of INTERACTION; without it, one begins where another ends.
-    stride: float | None = None
+    stride: Annotated[float | None, Bounds(sys.float_info.min)] = None
     #: Source of velocities and headings of INTERACTION: as logged, or the positions, where the logged ones don't fit.
     motion: Literal["logged", "positions"] = "logged"
     #: Metres from the ego's path within which map and agents are kept: for sources of whole districts (ScenarioNet).
-    radius: float | None = None
+    radius: Annotated[float | None, Bounds(sys.float_info.min)] = None
     exclude_overlaps: bool = False  # Leave out run segments in which a moving vehicle's box overlaps another.
     #: Give lights their last known state (before it: the first) where the log knows none (see docs/formats.md).
     hold_lights: bool = False
@@ -210,8 +210,7 @@ class Info(shared.Command):
 
     store: shared.Store
     json: shared.Json = None
-    #: Interactive agents to choose in each run segment, to count why the ego's partner was chosen; 0: none.
-    interactive: Natural = 2
+    interactive: Natural = 2  # Interactive agents to choose in each segment, and to count why; 0: none.
 
     def __call__(self) -> None:
         from symphony.data.convert import info

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from math import isnan
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -14,6 +14,8 @@ from symphony import errors, files
 from symphony.cli import shared
 from symphony.config import checks
 
+Rate = Literal["at_fault_collision_rate", "collision_rate", "red_light_rate", "offroad_rate", "wrong_way_rate",
+               "blocking_rate", "failed_rate"]  # fmt: skip
 Device = Annotated[str, arg(help="Device that simulates: `cpu`, `cuda` or `cuda:N`.")]
 
 
@@ -79,30 +81,29 @@ class Test(shared.Command):
                 shared.say(f"written: {index}")
         except (errors.SymphonyError, OSError) as error:
             raise errors.CouldNotRunError(str(error)) from error
-        if failing := sum(one.status != "passes" for one in result.verdicts):
-            raise errors.SymphonyError(
-                f"{failing} of {len(result.verdicts)} thresholds are not kept: see {index}"
-            )
+        count, failing = len(result.verdicts), sum(one.status != "passes" for one in result.verdicts)
+        if failing:
+            raise errors.SymphonyError(f"{failing} of {count} thresholds are not kept: see {index}")
 
 
 class Hunt(shared.Command):
     """Hunt for rare failures of a planner among learned agents, and estimate how often they happen.
 
     Traffic in which the ego comes near to a collision is simulated more often, and weighs less in turn, so that the
-    estimate has no bias. It is for these run segments; its error is one standard error over trees. Some runs that
-    show the failure are kept: see them with `symphony view`.
+    estimate has no bias. It holds for these run segments alone; its error is one standard error over trees. Some runs
+    that show the failure are kept: see them with `symphony view`.
     """
 
     #: Learned agent that drives the others: folder of a run (see `symphony train`), or `pretrained:NAME`.
     agent: Annotated[Positional[str], arg(metavar="RUN")]
-    planner: str  # Planner that drives the ego, one that can be copied, as for `symphony simulate`.
+    planner: str  # Planner that drives the ego, as for `symphony simulate`; a process can't be copied.
     data: Path  # Store of run segments.
     out: Path  # Folder of the runs that are kept, at most 3 of a run segment.
-    metric: str = "at_fault_collision_rate"  # Rate to estimate, one that a suite of `symphony test` can hold.
+    metric: Rate = "at_fault_collision_rate"  # Rate to estimate, in percent of runs (see docs/metrics.md).
     segments: shared.Segments = ()
     trust_code: shared.TrustCode = False
-    trees: Annotated[int, checks.Bounds(4)] = 8  # Independent trees of each run segment.
-    branches: Annotated[int, checks.Bounds(2)] = 32  # Branches of each tree.
+    trees: Annotated[int, checks.Bounds(4)] = 8  # Independent estimates of a run segment, by a tree each.
+    branches: Annotated[int, checks.Bounds(2)] = 32  # Rollouts of a tree; near a collision they are copied.
     interactive: checks.Natural = 0  # Agents that are driven, the ego included; 0: as the agent was trained.
     duration: checks.Natural = 0  # Seconds that are simulated; 0: as many as the agent was trained with.
     seed: int = 0  # Seed of everything that is drawn at random.

@@ -11,9 +11,9 @@ from tyro.conf import Positional, arg
 import symphony
 from symphony import errors, render
 from symphony.cli import shared
-from symphony.config.checks import Count
+from symphony.config.checks import Bounds, Count
 
-Runs = Annotated[Positional[shared.Paths], arg(metavar="RUN ...", help="Folders of runs.")]
+Runs = Annotated[Positional[shared.Paths], Bounds(distinct=True), arg(metavar="RUN ...", help="Run folders.")]
 
 
 class Curvature(shared.Command):
@@ -40,7 +40,10 @@ class Curvature(shared.Command):
             folder = split_name(str(run))[0]
             method = method_name(read_run(folder)["method"])
             held = choose_evaluation(folder, kept_evaluations(folder), self.evaluation)["curvature"]
-            policy, log = (np.array(held[part], dtype=np.int64) for part in ("policy", "log"))
+            counts = np.array([held.get("policy"), held.get("log")], dtype=object)  # of lists of one length
+            if counts.ndim != 2 or not all(type(n) is int and 0 <= n < 1 << 53 for n in counts.flat):
+                raise errors.DataError("an evaluation holds no counts", file=folder, field="curvature")
+            policy, log = counts.astype(np.int64)
             title = f"{method} ({run}): JSD {1000 * float(jensen_shannon(policy, log)):.2f} · 10⁻³"
             panels[title] = policy, log
         render.plot_curvature(panels, self.out)
@@ -52,12 +55,15 @@ class Curves(shared.Command):
     runs: Runs
     out: shared.Picture
     metrics: shared.Names = ()  # Names of the only metrics to draw; by default all there are.
-    window: float = 0.1  # Share of a run's records that a point is averaged over; 0 for not smoothing.
+    #: Share of a run's records that a point is averaged over; 0 for not smoothing.
+    window: Annotated[float, Bounds(0, 1)] = 0.1
 
     def __call__(self) -> None:
         from symphony.training.logging import read_metrics
 
         found = {str(folder): read_metrics(folder) for folder in self.runs}
+        if empty := [folder for folder, records in found.items() if not records]:
+            raise errors.DataError("is no run: it holds no metrics.jsonl with records", file=empty[0])
         render.plot_curves(found, self.out, metrics=self.metrics, window=self.window)
 
 
@@ -78,13 +84,12 @@ class Segment(shared.Command):
         store = symphony.SegmentStore(self.store)
         segment = store[shared.segment_indices(store, [self.segment])[0]]
         if not 0 <= self.step < segment.num_steps:
-            raise errors.ConfigError(
-                f"--step {self.step} is outside the {segment.num_steps} steps of the log"
-            )
+            raise errors.ConfigError(f"--step {self.step}: the segment has {segment.num_steps} steps")
         choice = interactive_choice(segment, self.interactive)
         title = segment.segment_id + (f" ({choice.context})" if choice.context else "")
-        agents = choice.agents.tolist()
-        render.plot_segment(segment, self.out, step=self.step, interactive=agents, title=title)
+        render.plot_segment(
+            segment, self.out, step=self.step, interactive=choice.agents.tolist(), title=title
+        )
 
 
 class Routes(shared.Command):

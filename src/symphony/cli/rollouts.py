@@ -25,8 +25,7 @@ class Simulate(shared.Simulation):
     out: Path  # Folder of the rollouts.
     #: Planner that drives the ego, while the agent drives the other interactive agents: `idm`, `log`, or one of your
     #: own: a file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback`
-    #: as the agent all others play back the log. Nothing is searched then, unless --search, --branches or --trees say
-    #: so: a search asks the planner once for each branch.
+    #: as the agent all others play back the log. There is no search unless --search, --branches or --trees say so.
     planner: str = ""
     planner_seconds: float = 60.0  # Seconds that a planner has for one answer; a longer one fails the run.
     #: Number of runs to simulate (a run is one rollout of one segment) in place of `rollouts`: evenly spread over the
@@ -136,7 +135,7 @@ class Report(shared.Command):
         from symphony.saved.folder import load_rollouts
 
         folder, out = load_rollouts(self.folder), self.out or self.folder
-        with shared.locked_folder(out, "report.lock"):
+        with files.Lock(out / "report.lock"):
             with shared.progress("evaluating") as advance:
                 found = report(folder, self.evaluated, advance)
             plain, totals = found.plain(), found.totals()
@@ -171,18 +170,18 @@ class Export(shared.Command):
         from symphony.saved.export import commonroad, to_dict
         from symphony.saved.folder import file_stem, load_rollouts
 
-        folder, count, suffix = load_rollouts(self.folder), 0, "json" if self.format == "json" else "xml"
+        folder, count, suffix, write = load_rollouts(self.folder), 0, "xml", commonroad
+        if self.format == "json":
+            suffix = "json"
+            write = lambda *of: json.dumps(to_dict(*of), ensure_ascii=False, allow_nan=False) + "\n"  # noqa: E731
         out = self.out or self.folder / "export"
-        with shared.locked_folder(out, "export.lock"):
+        with files.Lock(out / "export.lock"):
             for name in self.segments or folder.ids:
                 saved = folder.of(name)
                 for k in self.rollouts or range(saved.rollouts):
                     if not 0 <= k < saved.rollouts:
                         raise errors.ConfigError(f"{name} has rollouts 0 to {saved.rollouts - 1}, not {k}")
-                    if self.format == "json":
-                        text = json.dumps(to_dict(saved, k), ensure_ascii=False, allow_nan=False) + "\n"
-                    else:
-                        text = commonroad(saved, k)
+                    text = write(saved, k)
                     files.write_file(out / f"{file_stem(name)}-{k}.{suffix}", text)
                     count += 1
         shared.say(f"written: {count} files in {out}")

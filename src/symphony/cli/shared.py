@@ -21,7 +21,7 @@ class Result(str):
     """Marks the option of a file that a command writes once everything is done."""
 
 
-Paths = Annotated[tuple[Path, ...], checks.Bounds(1)]
+Paths = Annotated[tuple[Path, ...], checks.Bounds(1), arg(help_behavior_hint="(required)")]
 Names = Annotated[tuple[str, ...], arg(metavar="NAME ...")]
 Folder = Annotated[Path | None, arg(metavar="DIR")]
 ResultFile = Annotated[Path | None, Result(), arg(metavar="FILE")]
@@ -70,13 +70,6 @@ def segment_indices(store: symphony.SegmentStore, names: Sequence[str]) -> list[
     return list(found)
 
 
-def locked_folder(path: Path, name: str) -> files.Lock:
-    """Make a folder, and keep other writers out of it by a file of that name."""
-    with files.naming(path):
-        path.mkdir(parents=True, exist_ok=True)
-    return files.Lock(path / name)
-
-
 @contextmanager
 def progress(description: str, unit: str = "segments") -> Iterator[Callable[..., None]]:
     """A progress bar on standard error; gives a function of how much is done, the total, and maybe a note."""
@@ -84,8 +77,8 @@ def progress(description: str, unit: str = "segments") -> Iterator[Callable[...,
     from rich.markup import escape
     from rich.progress import Progress, TextColumn
 
-    columns = (*Progress.get_default_columns(), TextColumn("{task.fields[note]}"))
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    note = TextColumn("{task.fields[note]}")
+    with Progress(*Progress.get_default_columns(), note, console=Console(stderr=True)) as bar:
         task = bar.add_task(escape(description), total=None, note="")
 
         def advance(done: int, total: int | None, note: str = "") -> None:

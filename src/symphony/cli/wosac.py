@@ -37,7 +37,7 @@ class Score(shared.Command):
     config: Year = "2025"
     json: shared.Json = None
     per_object: bool = False  # Write the numbers of each scored object into the JSON, too.
-    features: shared.Folder = None  # Folder for what is compared, per object and step (SCENARIO_ID.npz).
+    features: shared.Folder = None  # Folder for the features of every object and step (SCENARIO_ID.npz).
     partial: bool = False  # Leave out scenarios without rollouts; otherwise each must have some.
     strict: Strict = False
     workers: shared.Workers = 1
@@ -105,8 +105,8 @@ class Table(shared.Command):
 class Submit(shared.Command):
     """Simulate 32 rollouts of every scenario of the Waymo Open Motion Dataset and write them as a submission.
 
-    Who drives what is as in `symphony wosac evaluate`. What happens after the current step of a scenario is not
-    looked at, so the test set will do. See docs/wosac.md.
+    The agent drives what it drives in `symphony wosac evaluate`. What happens after the current step of a scenario is
+    not looked at, so scenarios of the test set can be simulated. See docs/wosac.md.
     """
 
     agent: Agent

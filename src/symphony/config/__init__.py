@@ -7,13 +7,7 @@ of a training; what an agent is and how it is simulated travels with the agent.
 from __future__ import annotations
 
 from symphony.config.agent import AgentConfig, AgentSpec, DiscriminatorConfig, Score, SearchConfig
-from symphony.config.evaluation import (
-    EvaluateConfig,
-    PaperData,
-    Setting,
-    TableFormat,
-    WosacSettings,
-)
+from symphony.config.evaluation import EvaluateConfig, PaperData, Setting, TableFormat, WosacSettings
 from symphony.config.files import read_json, to_json
 from symphony.config.training import (
     METHODS,

@@ -16,7 +16,8 @@ Score = Literal["discriminator", "flags", "rule"]
 Rule = Annotated[str, Names(("best", "systematic", "replace"))]
 Own = Annotated[str, Names(["paper"])]
 MOST = 10_000
-"""What the file of an agent may ask for, at most: points of each kind that are observed, branches."""
+"""What the file of an agent may ask for, at most: agents, points of each kind, branches, the width of a network."""
+Size = Annotated[int, Bounds(1, MOST)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,9 +25,9 @@ class AgentConfig(Settings):
     """What an agent observes and how large its networks are."""
 
     #: Interactive agents per run segment (the paper uses 2 and 8).
-    interactive: Annotated[Count, arg(aliases=("--interactive",))] = 2
+    interactive: Annotated[Size, arg(aliases=("--interactive",))] = 2
     #: Nearest map and light points that the agent observes (the paper: 1 000).
-    num_points: Annotated[int, Bounds(1, MOST)] = 200
+    num_points: Size = 200
     #: Nearest lights that the agent observes beside the points, however far they are (the paper: none).
     num_lights: Annotated[int, Bounds(0, MOST)] = 0
     #: Inputs of the policy. `paper`: objects and points around; `gaps`: also how far the agent is from the boxes of
@@ -43,7 +44,7 @@ class AgentConfig(Settings):
     #: Cells along and across of a histogram that displacements are drawn from, an odd number (methods mgail*; 0: one
     #: Gaussian instead, as in the paper).
     cells: Annotated[int, Bounds(0, 1001)] = 0
-    hidden: Count = 64  # Width of the element encoders; the action head is twice as wide.
+    hidden: Size = 64  # Width of the element encoders; the action head is twice as wide.
     #: Encoder of policy and goal policy. `paper`: element MLPs and max-pool; or the import path of your own, with the
     #: signature of `symphony.modules.SceneEncoder`.
     encoder: Own = "paper"
@@ -71,7 +72,7 @@ class DiscriminatorConfig(Settings):
     #: course.
     features: Features = "clearance"
     #: Width of the discriminator's encoders; its head is twice as wide.
-    hidden: Annotated[Count, Suppress] = 32
+    hidden: Annotated[Size, Suppress] = 32
     #: Discriminator: `paper`, or the import path of a function from an `AgentSpec` to a module that writes one logit
     #: per agent.
     network: Own = "paper"
@@ -83,33 +84,28 @@ class DiscriminatorConfig(Settings):
 class SearchConfig(Settings):
     """The beam search and what is learned from it."""
 
-    branches: Annotated[int, Bounds(1, MOST)] = 4  # Branches per run segment in training (S).
-    test_branches: Annotated[int, Bounds(1, MOST)] = 16  # Branches per run segment in evaluation.
+    branches: Size = 4  # Branches per run segment in training (S).
+    test_branches: Size = 16  # Branches per run segment in evaluation.
     prune_every: Count = 2  # Steps between prunings (T_p; 10 in the paper).
     #: Rule that prunes. `best`: the better half of the branches survives (the paper); `systematic`: every branch gets
-    #: copies in proportion to exp(-score / temperature), as in a particle filter, which bears and wants more
-    #: prunings; `replace`: only branches above `threshold` make room, for copies of others, of the same goals where
-    #: there are any; or the import path of a pruning rule of your own.
+    #: copies in proportion to exp(-score / temperature), as in a particle filter, which should prune more often;
+    #: `replace`: branches whose score is above `threshold` are replaced by copies of others, of those with the same
+    #: goals if there are any; or the import path of a pruning rule of your own.
     rule: Rule = "systematic"
     temperature: Positive = 0.6  # Temperature of rule `systematic`: the lower, the stricter.
-    #: Highest total, in logits of the discriminator, that a branch goes on with under rule `replace`.
+    #: Highest score, in logits of the discriminator, with which rule `replace` lets a branch go on.
     threshold: float = 1.0
-    #: Branches that draw goals together: all of a `tree` (the paper), or each `branch` alone.
+    #: Who shares goals: all branches of a `tree` (the paper), or nobody, as each `branch` draws its own.
     goals: Literal["tree", "branch"] = "tree"
     #: Search that the agent is simulated with unless something else is asked for: `tree` (the paper), `backtrack`.
     way: Annotated[Literal["tree", "backtrack"], Fixed, Suppress] = "tree"
     score: Annotated[Score, Fixed, Suppress] = "discriminator"  # Score that this search lowers.
     updates: Count = 10  # Updates made from the results of one search before the next.
-    #: States per update of the surviving rollouts for the policy, and of the simulated and the logged ones each for
-    #: the discriminator; every state is of all its interactive agents.
+    #: States per update: so many of the surviving rollouts for the policy to learn from, and so many of all rollouts
+    #: and of the log for the discriminator; each is of all interactive agents of its run segment.
     states: Count = 256
-    GONE: ClassVar = {
-        "keep": 0.5,
-        "aggregate": "max_then_sum",
-        "segments": ...,
-        "weight": ...,
-        "survivors": ...,
-    }
+    _TRAINED: ClassVar = dict.fromkeys(("segments", "weight", "survivors"), ...)
+    GONE: ClassVar = {"keep": 0.5, "aggregate": "max_then_sum", **_TRAINED}
 
 
 @dataclass(frozen=True, kw_only=True)

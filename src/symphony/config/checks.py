@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import math
 import sys
+from collections import Counter
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
@@ -11,16 +13,18 @@ from symphony.errors import ConfigError
 
 
 class Bounds(NamedTuple):
-    """Marks a setting with the least and the most that it may be."""
+    """Marks a setting with the least and the most that it may be, or how many values it has at least."""
 
     least: float = 0.0
     most: float = sys.float_info.max
+    distinct: bool = False
 
 
 class Names(tuple[str, ...]):
     """Marks a setting that is one of some names, or an import path."""
 
 
+LEAST = {0: "not be negative", 1: "be positive", sys.float_info.min: "be positive"}
 Count = Annotated[int, Bounds(1)]
 Natural = Annotated[int, Bounds()]
 Positive = Annotated[float, Bounds(sys.float_info.min)]
@@ -34,19 +38,30 @@ class Settings:
     def __post_init__(self) -> None:
         kind: Any = type(self)
         for name, hint in type_hints(kind).items():
-            value, told = getattr(self, name), name.replace("_", "-")
-            for mark in getattr(hint, "__metadata__", ()):
-                if isinstance(mark, Bounds) and not mark.least <= value <= mark.most:
-                    least = "not be negative" if mark.least == 0 else f"be at least {mark.least}"
-                    least = "be positive" if mark.least > 0 else least
-                    rule = f"be at most {mark.most}" if value > mark.most else least
-                    raise ConfigError(f"{told} must {rule}, is {value}")
-                if isinstance(mark, Names) and value not in mark and ":" not in value:
-                    more = "or an import path such as my.module:Name"
-                    raise ConfigError(f"{told} is one of {', '.join(mark)} {more}, not '{value}'")
-            plain = hint.__origin__ if get_origin(hint) is Annotated else hint
-            if get_origin(plain) is Literal and value not in get_args(plain):
-                raise ConfigError(f"{told} is one of {', '.join(get_args(plain))}, not '{value}'")
+            check(name.replace("_", "-"), getattr(self, name), hint)
+
+
+def check(told: str, value: Any, hint: Any) -> None:
+    """Raise ConfigError for a value, told by this name, that an annotation does not allow."""
+    if isinstance(value, float) and math.isnan(value):
+        raise ConfigError(f"{told} must be a number, is nan")
+    for mark in getattr(hint, "__metadata__", ()):
+        if isinstance(mark, Bounds) and isinstance(value, tuple):
+            if len(value) < mark.least:
+                raise ConfigError(f"give at least {mark.least} {told}")
+            if mark.distinct and len(set(value)) < len(value):
+                raise ConfigError(f"{told}: {Counter(value).most_common(1)[0][0]} is given twice")
+        elif isinstance(mark, Bounds) and value is not None and not mark.least <= value <= mark.most:
+            least = LEAST.get(mark.least, f"be at least {mark.least}")
+            raise ConfigError(
+                f"{told} must {f'be at most {mark.most}' if value > mark.most else least}, is {value}"
+            )
+        elif isinstance(mark, Names) and value not in mark and ":" not in value:
+            more = "or an import path such as my.module:Name"
+            raise ConfigError(f"{told} is one of {', '.join(mark)} {more}, not '{value}'")
+    plain = hint.__origin__ if get_origin(hint) is Annotated else hint
+    if get_origin(plain) is Literal and value not in get_args(plain):
+        raise ConfigError(f"{told} is one of {', '.join(get_args(plain))}, not '{value}'")
 
 
 @functools.cache

@@ -38,8 +38,8 @@ def check_planner_seconds(seconds: float) -> None:
 class SimulationConfig(Settings):
     """How an agent is simulated, whatever the rollouts are for."""
 
-    #: Search that the rollouts come from. `agent`: as the agent was trained; `none`; `tree`: beam
-    #: search; `backtrack`: independent rollouts, each of which goes back and tries again where it is bad; `best`:
+    #: Search that the rollouts come from. `agent`: the agent's own; `none`: no search; `tree`: beam search;
+    #: `backtrack`: independent rollouts, each of which goes back and tries again where it is bad; `best`:
     #: independent rollouts, of which that with the best score counts.
     search: Search = "agent"
     #: Score that a search lowers. `agent`: as is best for the agent (the discriminator, unless its card says
@@ -52,11 +52,11 @@ class SimulationConfig(Settings):
     #: Steps between prunings, or after which a rollout may go back; 0: as the agent was trained.
     prune_every: Natural = 0
     temperature: NotNegative = 0.0  # Temperature of rule `systematic`; 0: as the agent was trained.
-    #: Highest total of a good branch, for rule `replace` and for `backtrack`; by default as the agent was trained,
-    #: and 0 where a score is 1 for each agent that is bad (`flags`, `rule`).
+    #: Highest score of a good branch, for rule `replace` and for `backtrack`; by default as the agent was trained,
+    #: and 0 for scores that count what is bad (`flags`, `rule`).
     threshold: float | None = None
-    #: Branches that draw goals together: all of a `tree` (the paper), or each `branch` alone; `agent`: as the agent
-    #: is meant to.
+    #: Who shares goals: all branches of a `tree` (the paper), or nobody, as each `branch` draws its own; `agent`: as
+    #: the agent was trained.
     goals: Goals = "agent"
     #: Temperature of the draw of discrete actions: below 1 likely ones become likelier, above 1 the rare ones.
     action_temperature: Positive = 1.0
@@ -85,9 +85,9 @@ class SimulationConfig(Settings):
 class EvaluateConfig(SimulationConfig):
     """How agents are evaluated."""
 
-    rollouts: Count = 16  # Rollouts per run segment that count.
-    #: Search trees per run segment, each with goals of its own; each gives its share of the rollouts. Where that is
-    #: less than all of its leaves, take `goals` of the tree: among those of branches the discriminator would choose.
+    rollouts: Count = 16  # Rollouts of each run segment.
+    #: Search trees per run segment, each with goals of its own; each gives its share of the rollouts. If those are
+    #: fewer than its branches, use `--goals tree`: with goals of branches, the score would choose among goals, too.
     trees: Count = 1
     logged_goals: bool = False  # Give agents the routes of the log instead of sampled ones.
     #: Seconds of each run segment that are simulated; 0: as many as the agent was trained with.
@@ -102,7 +102,7 @@ class EvaluateConfig(SimulationConfig):
     #: the same ones are driven from the first step to the last.
     open_traffic: bool = False
     #: Driver of the other vehicles: the `log`, `constant_velocity`, `idm` (a car-follower, along the route of the
-    #: log) or the agent itself (`learned`). Nobody evaluates them; traffic is open for all but the log.
+    #: log) or the agent itself (`learned`). They are not evaluated; traffic is open for all but the log.
     others: Others = "log"
     #: Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout.
     metric: tuple[str, ...] = ()

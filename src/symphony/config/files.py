@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 import types
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -56,20 +57,20 @@ def from_dict(kind: Any, values: dict[str, Any], *, where: str = "") -> Any:
     """
     hints, fields = type_hints(kind), {f.name: f for f in dataclasses.fields(kind)}
     gone = getattr(kind, "GONE", {})
-    for name, held in gone.items():
-        meant = held(values) if callable(held) else held
-        if meant is not ... and values.get(name, meant) != meant:
-            raise ConfigError(f"{where}setting '{name}' is gone: this version reads only {meant!r}")
     before = {f.name: f.metadata["before"] for f in fields.values() if "before" in f.metadata}
-    values = before | {name: value for name, value in values.items() if name not in gone}
-    for name in values:
+    given = before | {name: value for name, value in values.items() if name not in gone}
+    for name in given:
         if name not in fields:
             raise ConfigError(f"{where}unknown setting '{name}'")
     for name, field in fields.items():
         needed = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        if needed and name not in values:
+        if needed and name not in given:
             raise ConfigError(f"{where}setting '{name}' is missing")
-    built = {name: _typed(hints[name], value, where, name) for name, value in values.items()}
+    built = {name: _typed(hints[name], value, where, name) for name, value in given.items()}
+    for name, held in gone.items():
+        meant = held(built) if callable(held) else held
+        if meant is not ... and values.get(name, meant) != meant:
+            raise ConfigError(f"{where}setting '{name}' is gone: this version reads only {meant!r}")
     try:
         return kind(**built)
     except ConfigError as error:
@@ -100,7 +101,7 @@ def _plain(hint: Any, value: Any, where: str, name: str) -> Any:
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if hint is Path and isinstance(value, str):
         return Path(value)
-    if hint is float and number:
+    if hint is float and number and abs(value) <= sys.float_info.max:
         return float(value)
     if isinstance(hint, type) and isinstance(value, hint) and (number or hint is not int):
         return value

@@ -11,10 +11,10 @@ Profile = Literal["default", "paper", "recommended", "laptop", "tiny", "smoke"]
 WORDS = (
     "Settings that go together. default: the values shown; paper: the protocol of the paper (70 000 updates, 1 "
     "000 points, its discriminator, batch 16, S 4 and 16, 200 validation segments); recommended: what gave the "
-    "best agents so far (inputs beyond the paper's, displaced states, only bad branches replaced, goals of each "
-    "branch; 3 000 updates, 200 points); laptop: meant for two cores and about an hour (3 000 updates, 128 "
+    "best agents so far (inputs beyond the paper's, displaced states, rule `replace`, branches with goals of their "
+    "own; 3 000 updates, 200 points); laptop: meant for two cores and about an hour (3 000 updates, 128 "
     "points, 48 validation segments of 4 rollouts); tiny: half a minute, what `make table` runs; smoke: seconds, "
-    "to see that all runs. What is given beside it has precedence; the best checkpoint is chosen where "
+    "to see that all runs. Options that are given beside it have precedence; the best checkpoint is chosen where "
     "--validation.data is given."
 )
 PROFILES: dict[Profile, str] = {

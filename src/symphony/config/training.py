@@ -95,7 +95,7 @@ class RunConfig(Settings):
 
     data: Path  # Store of run segments to learn from (see `symphony data convert`).
     out: Path  # Folder of the run: configuration, metrics, checkpoints.
-    steps: Count = 3000  # Updates (the paper: 70 000).
+    steps: Count = 3000  # Updates of the networks (the paper: 70 000).
     seed: Annotated[int, Bounds(-MAX_SEED, MAX_SEED)] = 0  # Seed of the weights and of the order of the data.
     #: Folder of a run whose networks training starts from, its best checkpoint if it was validated, else its
     #: last (`RUN@last` or `RUN@3000` names another), or `pretrained:NAME`; new ones where that run has none.
@@ -122,7 +122,7 @@ class TrainConfig(RunConfig):
     method: Positional[Method]
     #: Seconds of each run segment that are used (the paper: 10 and 20; 0: all there are).
     duration: Natural = 0
-    agent: AgentConfig = field(default_factory=AgentConfig)  # The agent.
+    agent: AgentConfig = field(default_factory=AgentConfig)  # What the agent observes, its networks.
     segments: Annotated[Count, arg(name="batch")] = 16  # Run segments per update, and per search.
     states: Count = 1024  # Expert states per update, drawn from those segments.
     perturb: PerturbConfig = field(default_factory=PerturbConfig)  # Displaced expert states.

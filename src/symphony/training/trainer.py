@@ -230,7 +230,6 @@ class Trainer:
         with contextlib.ExitStack() as held:
             self.world.wait()  # no process writes before all have looked at what there is
             if self.world.is_main:
-                self.config.out.mkdir(parents=True, exist_ok=True)
                 self._lock = held.enter_context(Lock(self.config.out / LOCK))
                 if checkpoint_to_resume(self.config) != self.done:
                     raise ConfigError(f"{self.config.out}: another process went on with this run meanwhile")

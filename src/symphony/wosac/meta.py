@@ -13,15 +13,15 @@ class SubmissionMeta:
         account_name: E-mail address registered with the challenge.
         unique_method_name: Short name on the leaderboard.
         uses_lidar_data: Whether the model uses lidar data.
-        uses_camera_data: Whether it uses camera data.
+        uses_camera_data: Whether the model uses camera data.
         uses_public_model_pretraining: Whether public models were used for pre-training.
-        num_model_parameters: A number with a suffix, such as ``200K``.
-        acknowledge_complies_with_closed_loop_requirement: That every step was simulated from the steps before it.
-        authors: Their names.
-        affiliation: Of the authors.
-        description: Of the method.
+        num_model_parameters: Number of parameters with a suffix, such as `200K`.
+        acknowledge_complies_with_closed_loop_requirement: Whether every step was simulated from those before it.
+        authors: Names of the authors.
+        affiliation: Affiliation of the authors.
+        description: Description of the method.
         method_link: A page on the method.
-        public_model_names: Which public models.
+        public_model_names: Names of the public models.
     """
 
     account_name: str
