@@ -8,7 +8,6 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from functools import cache
 from unittest import mock
 
 from tyro.extras import SubcommandApp
@@ -16,12 +15,16 @@ from tyro.extras import SubcommandApp
 from symphony import cli
 
 
-def words() -> list[str]:
+def words(told: dict[str, str]) -> list[str]:
     """A line for each argument of each command, as its help shows it."""
-    return [" ".join([*command, word]) for command in commands() for word in _told(command)]
+    return [f"{command} {word}" for command, text in told.items() for word in _words(text)]
 
 
-@cache
+def helps() -> dict[str, str]:
+    """The help of every command."""
+    return {" ".join(command): help_of(*command) for command in commands()}
+
+
 def help_of(*command: str) -> str:
     """The help of a command."""
     with mock.patch.dict(os.environ, {"COLUMNS": "110"}):  # no wider, or boxes stand beside one another
@@ -39,9 +42,9 @@ def commands(app: SubcommandApp = cli.app, *before: str) -> list[tuple[str, ...]
     return found
 
 
-def _told(command: tuple[str, ...]) -> Iterator[str]:
+def _words(told: str) -> Iterator[str]:
     title = ""
-    for line in help_of(*command).splitlines():
+    for line in told.splitlines():
         if re.match(r" \w", line):
             title = line.split()[0]
         elif found := re.match(
@@ -53,4 +56,4 @@ def _told(command: tuple[str, ...]) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    sys.stdout.write("\n".join(words()) + "\n")
+    sys.stdout.write("\n".join(words(helps())) + "\n")

@@ -86,6 +86,12 @@ def hide(segment: RunSegment, agent: int, steps: slice) -> RunSegment:
     return segment.replace(**fields)
 
 
+def beginning(segment: RunSegment, steps: int) -> RunSegment:
+    """Its first steps."""
+    parts = {name: getattr(segment, name)[:, :steps] for name in (*schema.STATES, "signal_state")}
+    return segment.replace(**parts)
+
+
 def turned(segment: RunSegment, angle: float, shift: Any = 0.0) -> RunSegment:
     """The whole world turned counter-clockwise about its origin, and then moved."""
     c, s = np.cos(angle), np.sin(angle)

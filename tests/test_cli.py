@@ -17,7 +17,7 @@ import pytest
 import tyro
 
 import symphony.data.convert
-from helpers_cli import commands, help_of, words
+from helpers_cli import commands, words
 from helpers_processes import apart
 from helpers_saved import played
 from helpers_segments import crossing, straight_road
@@ -40,6 +40,14 @@ from symphony.errors import ConfigError, DataError
 from symphony.saved.folder import About, save_rollouts
 
 LINES = (Path(__file__).parent / "cli.txt").read_text().splitlines()
+HELPS = """
+import json, sys
+from helpers_cli import help_of, helps
+help_of()
+json.dump(helps(), sys.stdout)
+heavy = {"torch", "torchrl", "tensordict", "wandb", "matplotlib", "numpy", "shapely", "google.protobuf"}
+assert not heavy & set(sys.modules), heavy & set(sys.modules)
+"""
 
 
 @pytest.fixture
@@ -60,12 +68,22 @@ class MadeReader(Reader):
         yield DataError("has 5 wheels", file=path, segment="spare", field="agents")
 
 
+@pytest.fixture(scope="module")
+def told() -> dict[str, str]:
+    """The help of every command, which imports nothing heavy."""
+    done = subprocess.run(
+        [sys.executable, "-c", HELPS], cwd=Path(__file__).parent, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
 @pytest.mark.parametrize("command", commands(), ids=" ".join)
-def test_every_option_is_explained_in_whole_sentences(command: tuple[str, ...]) -> None:
-    told = help_of(*command)
-    assert told.startswith(f"usage: symphony {' '.join(command)} ")
-    helps = re.findall(r"^  --([\w.-]+)(.*?)\s*\((?:default|required)", told, re.M | re.S)
-    assert len(helps) == len(re.findall("^  --[a-z]", told, re.M))
+def test_every_option_is_explained_in_whole_sentences(command: tuple[str, ...], told: dict[str, str]) -> None:
+    text = told[" ".join(command)]
+    assert text.startswith(f"usage: symphony {' '.join(command)} ")
+    helps = re.findall(r"^  --([\w.-]+)(.*?)\s*\((?:default|required)", text, re.M | re.S)
+    assert len(helps) == len(re.findall("^  --[a-z]", text, re.M))
     for name, text in helps:
         assert re.search(r"\s[A-Z`].*\.$", text, re.S), f"--{name}: {text!r}"
 
@@ -74,8 +92,8 @@ def test_training_has_at_most_fifty_options() -> None:
     assert len([line for line in LINES if line.startswith("train --")]) <= 50
 
 
-def test_what_users_type_changes_on_purpose_only() -> None:
-    now = words()
+def test_what_users_type_changes_on_purpose_only(told: dict[str, str]) -> None:
+    now = words(told)
     assert now == LINES, (
         f"gone: {sorted(set(LINES) - set(now))}, new: {sorted(set(now) - set(LINES))}; "
         "say so in cli.GONE, and write the list anew: python tests/helpers_cli.py > tests/cli.txt"
@@ -113,9 +131,9 @@ def test_bounds_are_told_as_they_are_typed(args: str, told: str, capsys: Any) ->
     assert told in capsys.readouterr().err
 
 
-def test_what_is_required_shows_no_default() -> None:
-    for command in (("plot", "curves"), ("data", "merge"), ("table",), ("planners",), ("wosac", "table")):
-        assert re.search(r"\.\.\. +[A-Z][^()]*(\([^()]*\)[^()]*)?\(required\)", help_of(*command)), command
+def test_what_is_required_shows_no_default(told: dict[str, str]) -> None:
+    for command in ("plot curves", "data merge", "table", "planners", "wosac table"):
+        assert re.search(r"\.\.\. +[A-Z][^()]*(\([^()]*\)[^()]*)?\(required\)", told[command]), command
 
 
 def test_rates_that_are_hunted_are_those_of_a_suite() -> None:
@@ -271,28 +289,23 @@ def test_plot_refuses_what_it_cannot_draw(store: Path, change: str, tmp_path: Pa
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
 
-ALONE = """
+LOOKS = """
 import contextlib, io, sys
 from symphony.cli import main
-heavy, *commands = sys.argv[1:]
-for command in commands:
+for command in sys.argv[1:]:
     with contextlib.redirect_stdout(io.StringIO()):
         assert main(command.split()) == 0
-    assert not {*heavy.split()} & set(sys.modules), command
+    assert not {"torchrl", "tensordict", "torch._dynamo"} & set(sys.modules), command
 """
 
 
-def test_help_imports_nothing_heavy_and_looking_at_results_no_torchrl(tmp_path: Path) -> None:
+def test_looking_at_results_imports_no_torchrl(tmp_path: Path) -> None:
     save_rollouts(tmp_path / "sim", About("made"), [played(straight_road(2, steps=6))])
     (tmp_path / "metrics.jsonl").write_text('{"step": 1, "loss": 2.0}\n')
-    helps = [f"{' '.join(words)} --help" for words in ((), *commands())]
-    heavy = "torch torchrl tensordict wandb matplotlib numpy shapely google.protobuf"
     looks = ("agents", "plot curves . --out a.png", "view sim", "view sim --out b.png", "report sim")
-    for told in ((heavy, *helps), ("torchrl tensordict torch._dynamo", *looks)):
-        done = subprocess.run(
-            [sys.executable, "-c", ALONE, *told], cwd=tmp_path, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
+    command = [sys.executable, "-c", LOOKS, *looks]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_tables_are_aligned_and_never_break_a_name(capsys: pytest.CaptureFixture[str]) -> None:
@@ -345,13 +358,8 @@ def test_the_paper_is_followed() -> None:
 
 
 def test_what_is_given_has_precedence() -> None:
-    assert expanded(["bc", "--steps", "3", "--profile", "default"]) == [
-        "bc",
-        "--steps",
-        "3",
-        "--profile",
-        "default",
-    ]
+    words = ["bc", "--steps", "3", "--profile", "default"]
+    assert expanded(words) == words
     for steps in (["--steps", "7"], ["--steps=7"]):
         for args in ([*steps, "--profile", "smoke"], ["--profile", "smoke", *steps]):
             config = settings("bc", *args)

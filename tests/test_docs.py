@@ -21,6 +21,10 @@ import pytest
 
 import lint_length
 import symphony.cli
+from helpers_segments import beginning
+from helpers_store import fill
+from symphony.data.builtin import builtin_store
+from symphony.data.store import SegmentStore
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
@@ -59,9 +63,18 @@ def commands(page: str) -> list[list[str]]:
     return found
 
 
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Some of the built-in run segments, the first three seconds of each."""
+    found, out = SegmentStore(builtin_store("test")), tmp_path_factory.mktemp("brief") / "store"
+    fill(out, [beginning(found[k], 16) for k in range(4)])
+    return out
+
+
 @pytest.mark.filterwarnings("ignore::symphony.errors.DataWarning")  # code that an agent names, and is trusted
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")])
-def test_examples_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_run(page: str, brief: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("symphony.data.builtin.builtin_store", lambda split: brief)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     before, space = set(sys.modules), {"__name__": "example"}
@@ -151,6 +164,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONWARNINGS": "default"}
+    # Else ruff is started for each signature, to break its lines.
+    (hidden := tmp_path_factory.mktemp("hidden") / "ruff.py").write_text("raise ImportError\n")
+    environment["PYTHONPATH"] = os.pathsep.join(
+        [str(hidden.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    )
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return out

@@ -27,7 +27,7 @@ from symphony.data.builtin import builtin_store
 from symphony.data.segment import RunSegment, SignalState
 from symphony.data.store import SegmentStore
 from symphony.envs.dynamics import WHEELBASE
-from symphony.envs.scene import scene
+from symphony.envs.scene import collate, scene
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import report
 from symphony.learning.demonstrations import SceneDataset
@@ -392,18 +392,18 @@ LIMIT = 14.0
 """Of hand-made roads, m/s."""
 
 
-def driven(segment: RunSegment, planner: Any = "idm") -> Simulation:
+def driven(*segments: RunSegment, planner: Any = "idm") -> Simulation:
     """The ego by a planner, everyone else as logged."""
-    scenes = scene(segment, [segment.ego], LaneGraph(segment.road))
-    egos = EgoPlanners("mine", planner_maker(planner), [segment])
+    scenes = collate([scene(one, [one.ego], LaneGraph(one.road)) for one in segments])
+    egos = EgoPlanners("mine", planner_maker(planner), list(segments))
     return simulation(load_agent("playback"), scenes, EvaluateConfig(rollouts=1), egos=egos)
 
 
-def states(segment: RunSegment, planner: Any = "idm") -> Any:
-    """[T + 1, 4] of the ego in a run that did not fail."""
-    found = driven(segment, planner)
-    assert found.failed == ({},)
-    return found.rollouts.state[0, 0, :, 0].numpy()
+def states(*segments: RunSegment, planner: Any = "idm") -> Any:
+    """[B, T + 1, 4] of the egos in runs that did not fail."""
+    found = driven(*segments, planner=planner)
+    assert not any(found.failed)
+    return found.rollouts.state[:, 0, :, 0].numpy()
 
 
 def in_a_row(speeds: list[float], starts: list[float], steps: int = 131, lane: Any = 0) -> RunSegment:
@@ -417,17 +417,32 @@ def in_a_row(speeds: list[float], starts: list[float], steps: int = 131, lane: A
     return make_segment(road, np.stack([x, y], -1), 0 * x, velocity)
 
 
-def test_planners_that_build_on_idm_drive_as_they_say() -> None:
+ROWS = {
+    "standing-3": in_a_row([3, 0], [20, 130]),
+    "standing-14": in_a_row([14, 0], [20, 130]),
+    "leader": in_a_row([10, 8], [20, 45]),
+    "alone": in_a_row([10], [60]),
+    "others": in_a_row([10, 0, 0], [60, 100, 30], lane=(0, 1, 0)),
+}
+
+
+@pytest.fixture(scope="module")
+def rows() -> dict[str, Any]:
+    """What IDM does in each."""
+    return dict(zip(ROWS, states(*ROWS.values()), strict=True))
+
+
+def test_planners_that_build_on_idm_drive_as_they_say(rows: dict[str, Any]) -> None:
     """By their own parameters, and by their own plan where they have one."""
-    road = in_a_row([14.0, 0.0], [20.0, 130.0])
-    ends = [states(road, partial(IDMPlanner, gap=gap))[-1, 0] for gap in (2.0, 6.0)]
-    assert ends[0] - ends[1] == pytest.approx(4.0, abs=1.0)
-    np.testing.assert_allclose(np.diff(states(road, Halting)[:50, 3]), -0.2, atol=1e-4)
+    (wide,) = states(ROWS["standing-14"], planner=partial(IDMPlanner, gap=6.0))
+    assert rows["standing-14"][-1, 0] - wide[-1, 0] == pytest.approx(4.0, abs=1.0)
+    (halting,) = states(in_a_row([14, 0], [20, 130], steps=51), planner=Halting)
+    np.testing.assert_allclose(np.diff(halting[:50, 3]), -0.2, atol=1e-4)
 
 
-@pytest.mark.parametrize("speed", [3.0, 14.0])
-def test_idm_stops_behind_a_standing_car(speed: float) -> None:
-    found = states(in_a_row([speed, 0], [20, 130]))
+@pytest.mark.parametrize("speed", [3, 14])
+def test_idm_stops_behind_a_standing_car(speed: int, rows: dict[str, Any]) -> None:
+    found = rows[f"standing-{speed}"]
     gap = 130 - found[:, 0] - LENGTH
     assert gap.min() > 1.5
     assert gap[-1] < 3.0
@@ -438,39 +453,37 @@ def test_idm_stops_behind_a_standing_car(speed: float) -> None:
 
 def test_idm_keeps_its_place_where_steps_are_long() -> None:
     """Steps of more metres than are looked at around the last place."""
-    found = states(in_a_row([14, 0], [20, 180], steps=31).replace(dt=2.0))
+    (found,) = states(in_a_row([14, 0], [20, 180], steps=31).replace(dt=2.0))
     assert np.diff(found[:, 0]).max() > 20
     assert (180 - found[:, 0] - LENGTH).min() > 0
     assert found[-1, 3] < 0.5
 
 
-def test_idm_follows_at_its_headway() -> None:
+def test_idm_follows_at_its_headway(rows: dict[str, Any]) -> None:
     """Where nothing changes any more, s = (s0 + v T) / sqrt(1 - (v / v0)^4)."""
-    leader = 8.0
-    found = states(in_a_row([12, leader], [20, 60], steps=201))
-    gap = 60 + leader * 40 - found[-1, 0] - LENGTH
+    found, leader = rows["leader"], 8.0
+    gap = 45 + leader * 26 - found[-1, 0] - LENGTH
     assert found[-1, 3] == pytest.approx(leader, abs=0.05)
     assert gap == pytest.approx((2 + 1.5 * leader) / np.sqrt(1 - (leader / LIMIT) ** 4), abs=0.3)
 
 
-@pytest.mark.parametrize(("aside", "gap"), [(-0.4, 15.0), (0.0, 40.0)])
-def test_idm_stops_behind_a_standing_car_where_its_route_comes_by_twice(gap: float, aside: float) -> None:
-    segment = ring(gap, aside=aside)
-    assert (scene(segment, [0], LaneGraph(segment.road)).route_count.max() * 3 > 2 * np.pi * 15).item()
-    found = states(segment)
-    turned = np.arctan2(found[:, 0], -found[:, 1])
-    ahead = (0.2 + gap / 15 - turned) * 15.0
-    assert ahead.min() > LENGTH + 1.0
-    assert ahead[-1] < LENGTH + 5.0
-    assert found[-1, 3] < 0.5
+def test_idm_stops_behind_a_standing_car_where_its_route_comes_by_twice() -> None:
+    gaps = (15.0, 40.0)
+    segments = [ring(gap, aside=aside) for gap, aside in zip(gaps, (-0.4, 0.0), strict=True)]
+    for segment, gap, found in zip(segments, gaps, states(*segments), strict=True):
+        assert (scene(segment, [0], LaneGraph(segment.road)).route_count.max() * 3 > 2 * np.pi * 15).item()
+        turned = np.arctan2(found[:, 0], -found[:, 1])
+        ahead = (0.2 + gap / 15 - turned) * 15.0
+        assert ahead.min() > LENGTH + 1.0
+        assert ahead[-1] < LENGTH + 5.0
+        assert found[-1, 3] < 0.5
 
 
-def test_a_car_in_the_next_lane_or_behind_is_nobody_to_follow() -> None:
-    alone = states(in_a_row([10], [60], steps=91))
+def test_a_car_in_the_next_lane_or_behind_is_nobody_to_follow(rows: dict[str, Any]) -> None:
+    alone = rows["alone"]
     assert alone[-1, 3] == pytest.approx(LIMIT, abs=0.2)
     assert alone[:, 3].max() <= LIMIT + 1e-3
-    others = states(in_a_row([10, 0, 0], [60, 100, 30], lane=(0, 1, 0), steps=91))
-    np.testing.assert_allclose(alone, others, atol=1e-5)
+    np.testing.assert_allclose(alone, rows["others"], atol=1e-5)
 
 
 def test_idm_keeps_its_lane_in_turns() -> None:
@@ -479,7 +492,7 @@ def test_idm_keeps_its_lane_in_turns() -> None:
         signal_point=np.zeros((0, 3), np.float32),
         signal_state=np.zeros((0, 91), np.uint8),
     )
-    found = states(segment)
+    (found,) = states(segment)
     logged = LineString(segment.position[0, :, :2])
     inside = [xy for xy in found[:, :2] if logged.project(Point(xy)) < logged.length - 0.1]
     assert len(inside) > 45
@@ -501,32 +514,32 @@ def at_a_light(mine: SignalState, others: SignalState) -> RunSegment:
 
 def test_idm_stops_at_its_own_red_light_alone() -> None:
     red, free = at_a_light(SignalState.STOP, SignalState.GO), at_a_light(SignalState.GO, SignalState.STOP)
-    path = states(red)
+    path, other = states(red, free)
     stop = np.linalg.norm(red.signal_point[:, :2] - path[-1, :2], axis=-1).min()
     assert path[-1, 3] < 0.1
     assert 0.5 * LENGTH < stop < 0.5 * LENGTH + 4
-    assert states(free)[-1, 3] > 3
+    assert other[-1, 3] > 3
 
 
 def test_off_the_lanes_the_run_fails() -> None:
-    segment = in_a_row([10], [20])
+    segment = in_a_row([10], [20], steps=11)
     found = driven(segment.replace(position=segment.position + np.float32([0, 200, 0])))
     assert "on no lane" in found.failed[0][0]
     assert not found.rollouts.counted.any()
 
 
-@pytest.mark.parametrize("segment", [straight_road(3), crossing(4, seed=2)], ids=["straight", "crossing"])
-def test_log_playback_reproduces_the_log(segment: RunSegment) -> None:
-    found = states(segment, "log")
-    np.testing.assert_allclose(found[:, :2], segment.position[0, :, :2], atol=1e-4)
-    np.testing.assert_allclose(found[:, 2], segment.heading[0], atol=1e-4)
-    speed = np.hypot(*segment.velocity[0].T)
-    np.testing.assert_allclose(found[:, 3], speed, atol=1e-4)
+def test_log_playback_reproduces_the_log() -> None:
+    segments = straight_road(3), crossing(4, seed=2)
+    for segment, found in zip(segments, states(*segments, planner="log"), strict=True):
+        np.testing.assert_allclose(found[:, :2], segment.position[0, :, :2], atol=1e-4)
+        np.testing.assert_allclose(found[:, 2], segment.heading[0], atol=1e-4)
+        speed = np.hypot(*segment.velocity[0].T)
+        np.testing.assert_allclose(found[:, 3], speed, atol=1e-4)
 
 
 def test_holes_of_the_log_are_filled_and_its_end_is_told() -> None:
     whole = straight_road(3, steps=21)
-    found = driven(hide(hide(whole, 0, slice(8, 10)), 0, slice(16, 21)), "log")
+    found = driven(hide(hide(whole, 0, slice(8, 10)), 0, slice(16, 21)), planner="log")
     assert "step 15: ValueError: the log of the ego ends at step 15" in found.failed[0][0]
     assert found.rollouts.counted[0, 0].all(-1).tolist() == [True] * 15 + [False] * 5
     path = found.rollouts.state[0, 0, :16, 0].numpy()

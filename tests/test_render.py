@@ -193,7 +193,7 @@ def test_lanes_without_width_have_a_surface_and_those_of_one_point_none() -> Non
 
 def test_lights_stand_at_their_stop_points_in_their_state() -> None:
     segment, shown = crossing(), set()
-    for step in range(0, segment.num_steps, 5):
+    for step in range(0, segment.num_steps, 10):
         axes = plot_segment(segment, blank(), step=step, view=(-200.0, 200.0, -200.0, 200.0))
         for name, (_, _, states) in SIGNALS.items():
             there = np.isin(segment.signal_state[:, step], [int(state) for state in states])

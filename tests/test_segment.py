@@ -59,7 +59,7 @@ def refused(segment: RunSegment) -> str | None:
     return caught.value.field
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(segments())
 def test_made_segments_fit_and_equal_content_gives_equal_hashes(segment: RunSegment) -> None:
     assert validate(segment) is segment
