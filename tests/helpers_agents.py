@@ -21,14 +21,10 @@ def make_agent(
     """
     torch.manual_seed(seed)
     spec = AgentSpec(
-        action_space=space,
-        dt=0.2,
-        goals=True,
-        agent=AgentConfig(num_points=12, hidden=8, cells=cells),
-        discriminator=DiscriminatorConfig(hidden=8),
-        searches=True,
+        action_space=space, dt=0.2, goals=True, agent=AgentConfig(num_points=12, hidden=8, cells=cells),
+        discriminator=DiscriminatorConfig(hidden=8), searches=True,
         search=SearchConfig(**{"test_branches": 2, "prune_every": 3, **dict(search)}),
-    )
+    )  # fmt: skip
     return build_agent("tiny", replace(spec, **changes))
 
 

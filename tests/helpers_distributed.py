@@ -139,11 +139,8 @@ def main(rank: int, store: Path, out: Path) -> None:
         found["world"] = [world.rank, world.count, world.is_main]
         nan, inf = float("nan"), float("inf")
         own = {
-            "both": float(rank),
-            "one": 3.0 if rank else nan,
-            "none": nan,
-            "infinite": inf if rank else 1.0,
-        }
+            "both": float(rank), "one": 3.0 if rank else nan, "none": nan, "infinite": inf if rank else 1.0,
+        }  # fmt: skip
         mean = world.mean({name: torch.tensor(value) for name, value in own.items()})
         found["mean"] = {name: value.item() for name, value in mean.items()}
         found["losses"] = {kind: compare(kind, store, world) for kind in LOSSES}

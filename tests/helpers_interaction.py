@@ -29,13 +29,10 @@ WAYS = {
 }
 ROAD = {"type": "lanelet", "subtype": "road"}
 LANELETS = {
-    101: (22, 21, ROAD | {"maxspeed": "50"}, (201, 202)),
-    102: (23, 22, ROAD, ()),
-    103: (25, 24, ROAD, ()),
-    104: (26, 25, ROAD, ()),
-    105: (27, 28, {"type": "lanelet", "subtype": "crosswalk"}, ()),
+    101: (22, 21, ROAD | {"maxspeed": "50"}, (201, 202)), 102: (23, 22, ROAD, ()), 103: (25, 24, ROAD, ()),
+    104: (26, 25, ROAD, ()), 105: (27, 28, {"type": "lanelet", "subtype": "crosswalk"}, ()),
     106: (27, 28, {"type": "lanelet", "subtype": "walkway"}, ()),
-}
+}  # fmt: skip
 RULES = {
     201: ({"subtype": "traffic_light"}, {"ref_line": 29}),
     202: ({"subtype": "speed_limit", "sign_type": "de274-30"}, {}),

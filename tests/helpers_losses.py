@@ -41,13 +41,10 @@ CASES = [
 def spec(space: Any) -> AgentSpec:
     cells = 3 if space == "histogram" else 0
     return AgentSpec(
-        action_space="displacement" if cells else space,
-        dt=0.2,
-        goals=True,
+        action_space="displacement" if cells else space, dt=0.2, goals=True,
         agent=AgentConfig(num_points=20, num_lights=2, features="gaps", cells=cells, hidden=8),
-        discriminator=DiscriminatorConfig(features="foresight", hidden=8),
-        searches=True,
-    )
+        discriminator=DiscriminatorConfig(features="foresight", hidden=8), searches=True,
+    )  # fmt: skip
 
 
 def losses(agent: Any, env: DrivingEnv) -> dict[str, Any]:

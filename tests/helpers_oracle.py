@@ -52,13 +52,9 @@ def observed_points(
 def road_distance(scenes: SceneBatch, scene: Tensor, position: Tensor) -> Tensor:
     """Signed distance [M, K] of positions [M, K, 2] among all edges."""
     return signed_distance(
-        position,
-        scenes.edge_start[scene],
-        scenes.edge_end[scene],
-        scenes.edge_valid[scene],
-        scenes.edge_previous[scene],
-        scenes.edge_following[scene],
-    )
+        position, scenes.edge_start[scene], scenes.edge_end[scene], scenes.edge_valid[scene],
+        scenes.edge_previous[scene], scenes.edge_following[scene],
+    )  # fmt: skip
 
 
 def collisions(objects: Objects, index: Tensor) -> Tensor:
@@ -66,12 +62,8 @@ def collisions(objects: Objects, index: Tensor) -> Tensor:
     row = torch.arange(len(index))[:, None]
     own, size = objects.state[row, index], objects.size[row, index]
     hit = boxes_overlap(
-        own[:, :, None, :2],
-        own[:, :, None, 2],
-        size[:, :, None],
-        objects.state[:, None, :, :2],
-        objects.state[:, None, :, 2],
-        objects.size[:, None],
-    )
+        own[:, :, None, :2], own[:, :, None, 2], size[:, :, None], objects.state[:, None, :, :2],
+        objects.state[:, None, :, 2], objects.size[:, None],
+    )  # fmt: skip
     other = objects.valid[:, None] & (torch.arange(objects.valid.shape[1]) != index[..., None])
     return (hit & other).any(-1)

@@ -22,15 +22,10 @@ def make_road(lines, edges=(), left=(), right=(), types=None):
         lanes=Polylines.of([np.asarray(line, float) for line in lines.values()]),
         lane_id=np.arange(count, dtype=np.int64),
         lane_type=np.array([(types or {}).get(name, 2) for name in lines], np.uint8),
-        speed_limit=np.full(count, np.nan, np.float32),
-        lane_width=np.full(count, np.nan, np.float32),
-        successors=pairs(edges),
-        left_neighbors=pairs(left),
-        right_neighbors=pairs(right),
-        boundary=nothing,
-        marks=nothing,
-        mark_type=np.zeros(0, np.uint8),
-    )
+        speed_limit=np.full(count, np.nan, np.float32), lane_width=np.full(count, np.nan, np.float32),
+        successors=pairs(edges), left_neighbors=pairs(left), right_neighbors=pairs(right), boundary=nothing,
+        marks=nothing, mark_type=np.zeros(0, np.uint8),
+    )  # fmt: skip
     return road, index
 
 
@@ -115,23 +110,18 @@ def fork():
 def merge():
     """Two lanes that become one."""
     lines = {
-        "a": straight((0, 0), (50, 0)),
-        "b": straight((10, -20), (50, 0)),
-        "c": straight((50, 0), (150, 0)),
-    }
+        "a": straight((0, 0), (50, 0)), "b": straight((10, -20), (50, 0)), "c": straight((50, 0), (150, 0)),
+    }  # fmt: skip
     return make_road(lines, [("a", "c"), ("b", "c")])
 
 
 def pocket():
     """A road of three lanes in a row; beside the last one a turn pocket begins on the left, which alone turns."""
     lines = {
-        "first": straight((0, 0), (50, 0)),
-        "second": straight((50, 0), (100, 0)),
-        "third": straight((100, 0), (150, 0)),
-        "pocket": straight((100, 3.5), (150, 3.5)),
-        "turn": arc((150, 13.5), 10, -90, 0),
-        "on": straight((150, 0), (300, 0)),
-    }
+        "first": straight((0, 0), (50, 0)), "second": straight((50, 0), (100, 0)),
+        "third": straight((100, 0), (150, 0)), "pocket": straight((100, 3.5), (150, 3.5)),
+        "turn": arc((150, 13.5), 10, -90, 0), "on": straight((150, 0), (300, 0)),
+    }  # fmt: skip
     edges = [("first", "second"), ("second", "third"), ("third", "on"), ("pocket", "turn")]
     return make_road(lines, edges, left=[("third", "pocket")], right=[("pocket", "third")])
 

@@ -29,16 +29,13 @@ def played(segment: RunSegment, agents: Any = (0,), rollouts: int = 1, **changes
     state = np.concatenate([segment.position[rows, :, :2], heading[..., None], speed[..., None]], -1)
     shape = (rollouts, segment.num_steps - 1, len(rows))
     values: dict[str, Any] = {
-        "segment": segment,
-        "agents": rows,
+        "segment": segment, "agents": rows,
         "state": np.repeat(state.swapaxes(0, 1)[None], rollouts, 0).astype(np.float32),
         "counted": np.repeat(valid.T[None, 1:] & valid.T[None, :-1], rollouts, 0),
-        "collision": np.zeros(shape, bool),
-        "offroad": np.zeros(shape, bool),
-        "goal": np.full((rollouts, len(rows)), -1, np.int64),
-        "routes": Polylines.of([]),
+        "collision": np.zeros(shape, bool), "offroad": np.zeros(shape, bool),
+        "goal": np.full((rollouts, len(rows)), -1, np.int64), "routes": Polylines.of([]),
         "drivers": ("made",) * len(rows),
-    }
+    }  # fmt: skip
     return SavedRollouts(**{**values, **changes})
 
 
@@ -48,16 +45,13 @@ def random_trees(saved: SavedRollouts, branches: int = 4, every: int = 2, seed: 
     shape = (1, branches, saved.steps, len(saved.agents))
     periods = -(-saved.steps // every)
     return SavedTrees(
-        state=rng.normal(size=(*shape, 4)).astype(np.float32),
-        there=rng.random(shape) < 0.8,
-        collision=rng.random(shape) < 0.5,
-        offroad=rng.random(shape) < 0.5,
+        state=rng.normal(size=(*shape, 4)).astype(np.float32), there=rng.random(shape) < 0.8,
+        collision=rng.random(shape) < 0.5, offroad=rng.random(shape) < 0.5,
         score=rng.normal(size=shape).astype(np.float32),
         totals=rng.normal(size=(1, periods, branches)).astype(np.float32),
         parents=rng.integers(0, branches, (1, periods, branches)),
-        slots=rng.integers(0, branches, (1, periods, saved.rollouts)),
-        prune_every=every,
-    )
+        slots=rng.integers(0, branches, (1, periods, saved.rollouts)), prune_every=every,
+    )  # fmt: skip
 
 
 @lru_cache

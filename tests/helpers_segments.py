@@ -30,18 +30,13 @@ def make_road(
         return np.asarray(found, np.int32).reshape(-1, 2)
 
     return RoadMap(
-        lanes=Polylines.of(lanes),
-        lane_id=100 + np.arange(len(lanes), dtype=np.int64),
+        lanes=Polylines.of(lanes), lane_id=100 + np.arange(len(lanes), dtype=np.int64),
         lane_type=np.full(len(lanes), LaneType.SURFACE_STREET, np.uint8),
         speed_limit=np.full(len(lanes), 14, np.float32),
-        lane_width=np.full(len(lanes), LANE_WIDTH, np.float32),
-        successors=pairs(successors),
-        left_neighbors=pairs(left),
-        right_neighbors=pairs(right),
-        boundary=Polylines.of(boundary or []),
-        marks=Polylines.of(marks or []),
-        mark_type=np.full(len(marks or []), MarkType.ROAD_LINE, np.uint8),
-    )
+        lane_width=np.full(len(lanes), LANE_WIDTH, np.float32), successors=pairs(successors),
+        left_neighbors=pairs(left), right_neighbors=pairs(right), boundary=Polylines.of(boundary or []),
+        marks=Polylines.of(marks or []), mark_type=np.full(len(marks or []), MarkType.ROAD_LINE, np.uint8),
+    )  # fmt: skip
 
 
 def make_segment(
@@ -58,23 +53,14 @@ def make_segment(
     xyz = np.zeros((agents, steps, 3), np.float32)
     xyz[..., : position.shape[-1]] = position
     segment = RunSegment(
-        segment_id=segment_id,
-        source="made",
-        dt=dt,
-        ego=0,
-        agent_id=np.arange(agents, dtype=np.int64) + 7,
+        segment_id=segment_id, source="made", dt=dt, ego=0, agent_id=np.arange(agents, dtype=np.int64) + 7,
         agent_type=np.full(agents, AgentType.VEHICLE, np.uint8),
-        size=np.tile(np.asarray(CAR, np.float32), (agents, 1)),
-        position=xyz,
-        heading=np.asarray(heading, np.float32),
-        velocity=np.asarray(velocity, np.float32),
-        valid=np.ones((agents, steps), bool),
-        road=road,
-        signal_lane=np.zeros(0, np.int32),
-        signal_point=np.zeros((0, 3), np.float32),
-        signal_state=np.zeros((0, steps), np.uint8),
+        size=np.tile(np.asarray(CAR, np.float32), (agents, 1)), position=xyz,
+        heading=np.asarray(heading, np.float32), velocity=np.asarray(velocity, np.float32),
+        valid=np.ones((agents, steps), bool), road=road, signal_lane=np.zeros(0, np.int32),
+        signal_point=np.zeros((0, 3), np.float32), signal_state=np.zeros((0, steps), np.uint8),
         origin=np.zeros(3),
-    )
+    )  # fmt: skip
     return validate(segment.replace(**changes))
 
 
@@ -147,20 +133,15 @@ def straight_road(
     top = (num_lanes - 0.5) * LANE_WIDTH
     lower = np.arange(num_lanes - 1)
     road = make_road(
-        [line(k * LANE_WIDTH) for k in range(num_lanes)],
-        left=np.stack([lower, lower + 1], -1),
-        right=np.stack([lower + 1, lower], -1),
-        boundary=[line(-LANE_WIDTH / 2), line(top, x[::-1])],
+        [line(k * LANE_WIDTH) for k in range(num_lanes)], left=np.stack([lower, lower + 1], -1),
+        right=np.stack([lower + 1, lower], -1), boundary=[line(-LANE_WIDTH / 2), line(top, x[::-1])],
         marks=[line((k + 0.5) * LANE_WIDTH) for k in range(num_lanes - 1)],
-    )
+    )  # fmt: skip
     return make_segment(
-        road,
-        np.stack([px, np.broadcast_to(lane[:, None] * LANE_WIDTH, px.shape)], -1),
-        np.zeros_like(px),
-        np.stack([np.broadcast_to(speed[:, None], px.shape), np.zeros_like(px)], -1),
-        dt,
+        road, np.stack([px, np.broadcast_to(lane[:, None] * LANE_WIDTH, px.shape)], -1), np.zeros_like(px),
+        np.stack([np.broadcast_to(speed[:, None], px.shape), np.zeros_like(px)], -1), dt,
         **{"segment_id": f"straight-{seed}", **changes},
-    )
+    )  # fmt: skip
 
 
 def crossing_road(arm: float = 120.0) -> RoadMap:
@@ -258,18 +239,14 @@ def random_segment(
     valid[ego, 0] = True
     road = make_road([floats(3, 3)] * lanes)
     road = dataclasses.replace(
-        road,
-        lanes=lines(lanes, 2),
-        lane_id=rng.permutation(lanes).astype(np.int64) + 2**40,
+        road, lanes=lines(lanes, 2), lane_id=rng.permutation(lanes).astype(np.int64) + 2**40,
         lane_type=picks(len(LaneType), lanes).astype(np.uint8),
         speed_limit=np.where(rng.random(lanes) < 0.5, np.nan, rng.uniform(5, 30, lanes)).astype(np.float32),
         successors=picks(lanes, int(rng.integers(4)), 2),
         left_neighbors=picks(lanes, int(rng.integers(3)), 2),
-        right_neighbors=picks(lanes, int(rng.integers(3)), 2),
-        boundary=lines(int(rng.integers(3)), 2),
-        marks=lines(marks, 1),
-        mark_type=picks(len(MarkType), marks).astype(np.uint8),
-    )
+        right_neighbors=picks(lanes, int(rng.integers(3)), 2), boundary=lines(int(rng.integers(3)), 2),
+        marks=lines(marks, 1), mark_type=picks(len(MarkType), marks).astype(np.uint8),
+    )  # fmt: skip
     return make_segment(
         road,
         # Within the limits of speed even after smoothing: a metre or two from step to step.
@@ -299,15 +276,10 @@ def segments(segment_ids: st.SearchStrategy[str] | None = None) -> st.SearchStra
     """Small arbitrary segments of all shapes the schema allows."""
     names = segment_ids or st.text(min_size=1, max_size=8).filter(lambda name: "/" not in name)
     return st.builds(
-        random_segment,
-        segment_id=names.filter(lambda name: name.isprintable()),
-        seed=st.integers(0, 2**32 - 1),
-        agents=st.integers(1, 5),
-        steps=st.integers(2, 7),
-        lanes=st.integers(1, 4),
-        lights=st.integers(0, 3),
-        marks=st.integers(0, 3),
-    )
+        random_segment, segment_id=names.filter(lambda name: name.isprintable()),
+        seed=st.integers(0, 2**32 - 1), agents=st.integers(1, 5), steps=st.integers(2, 7),
+        lanes=st.integers(1, 4), lights=st.integers(0, 3), marks=st.integers(0, 3),
+    )  # fmt: skip
 
 
 def ring(gap: float = 25.0, radius: float = 15.0, steps: int = 51, aside: float = 0.2) -> RunSegment:

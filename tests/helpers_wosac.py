@@ -25,22 +25,15 @@ def made_scenario(agents: int = 4, seed: int = 0, **changes: Any) -> WosacScenar
     x = speed * step + rng.random((agents, 1)) * 10
     position = np.stack((x, np.broadcast_to(4.0 * np.arange(agents)[:, None], x.shape), np.zeros_like(x)), -1)
     arrays = {
-        "object_id": 10 + np.arange(agents),
-        "object_type": np.ones(agents, int),
-        "position": position,
+        "object_id": 10 + np.arange(agents), "object_type": np.ones(agents, int), "position": position,
         "heading": np.zeros((agents, 91), np.float32),
         "size": np.tile(np.array([4.5, 2.0, 1.5], np.float32), (agents, 1)),
-        "valid": np.ones((agents, 91), bool),
-        "evaluated": np.array([10, 11]),
-        "road_edges": [ROAD],
+        "valid": np.ones((agents, 91), bool), "evaluated": np.array([10, 11]), "road_edges": [ROAD],
         "lanes": [np.array([(k, y, 0.0) for k in range(0, 100, 5)]) for y in (0.0, 4.0)],
-        "lane_id": np.array([7, 8]),
-        "lane_type": np.array([2, 2]),
-        "signal_step": np.arange(91),
-        "signal_lane": np.full(91, 7),
-        "signal_state": np.where(np.arange(91) >= 20, 4, 6),
+        "lane_id": np.array([7, 8]), "lane_type": np.array([2, 2]), "signal_step": np.arange(91),
+        "signal_lane": np.full(91, 7), "signal_state": np.where(np.arange(91) >= 20, 4, 6),
         "signal_point": np.tile([30.0, 0.0], (91, 1)),
-    }
+    }  # fmt: skip
     return WosacScenario("made", **{**arrays, **changes})
 
 

@@ -192,22 +192,14 @@ def test_maps_without_a_part(name: str, tmp_path: Path) -> None:
         assert (error.file, error.segment, error.field) == (argoverse2.map_path(path), NAME, name)
 
 
-@pytest.mark.parametrize(
-    ("keys", "value", "kind"),
-    [
-        (LANE, 3, NO_LANE),
-        ((*LANE, "id"), True, NO_LANE),
-        ((*LANE, "lane_type"), [], NO_LANE),
-        ((*LANE, "successors"), ..., NO_LANE),
-        ((*LANE, "predecessors"), [2**63], NO_LANE),
-        (LEFT, [{"x": 1.0, "y": float("nan")}], NO_LANE),
-        (LEFT, [{"x": 10**400, "y": 2}], NO_LANE),
-        (LEFT, [{"x": "7", "y": 2}], NO_LANE),
-        (LEFT, {}, NO_LANE),
-        (("drivable_areas", "1", "area_boundary"), points([(0, 0), (1, 1)]), NO_AREA),
-        (("pedestrian_crossings", "5", "edge2"), points([(0, 0)]), NO_CROSSING),
-    ],
-)
+@pytest.mark.parametrize(("keys", "value", "kind"), [
+    (LANE, 3, NO_LANE), ((*LANE, "id"), True, NO_LANE), ((*LANE, "lane_type"), [], NO_LANE),
+    ((*LANE, "successors"), ..., NO_LANE), ((*LANE, "predecessors"), [2**63], NO_LANE),
+    (LEFT, [{"x": 1.0, "y": float("nan")}], NO_LANE), (LEFT, [{"x": 10**400, "y": 2}], NO_LANE),
+    (LEFT, [{"x": "7", "y": 2}], NO_LANE), (LEFT, {}, NO_LANE),
+    (("drivable_areas", "1", "area_boundary"), points([(0, 0), (1, 1)]), NO_AREA),
+    (("pedestrian_crossings", "5", "edge2"), points([(0, 0)]), NO_CROSSING),
+])  # fmt: skip
 def test_unreadable_entries_go(keys: tuple[str, ...], value: Any, kind: str, tmp_path: Path) -> None:
     found = read_one("argoverse2", written_with(tmp_path, keys, value))
     assert list(found.odd) == [kind]

@@ -71,18 +71,12 @@ def test_the_rate_of_a_chain_is_found_without_bias_by_few_branches(rule: Systema
     torch.manual_seed(0)
     rows, branches = 200, 64
     found = beam_search(
-        Chain(),
-        lambda td: td.set("action", 1.0 - 2.0 * (torch.rand(*td.shape, 1) >= UP)),
+        Chain(), lambda td: td.set("action", 1.0 - 2.0 * (torch.rand(*td.shape, 1) >= UP)),
         lambda td: torch.zeros_like(td["x"]),
-        branch(TensorDict({"x": torch.zeros(rows, 1)}, [rows]), branches),
-        steps=STEPS,
-        prune_every=2,
-        rule=rule,
-        noise=torch.rand(rows, STEPS // 2),
-        value=lambda td: -0.8 * td["x"].squeeze(-1),
-        prune_last=False,
-        keep=[("next", "x")],
-    )
+        branch(TensorDict({"x": torch.zeros(rows, 1)}, [rows]), branches), steps=STEPS, prune_every=2,
+        rule=rule, noise=torch.rand(rows, STEPS // 2), value=lambda td: -0.8 * td["x"].squeeze(-1),
+        prune_last=False, keep=[("next", "x")],
+    )  # fmt: skip
     top = found.trajectories["next", "x"][..., -1, 0] >= TOP
     estimates, rate = (leaf_weights(found) * top).mean(-1), known_rate()
     error = float(estimates.std()) / math.sqrt(rows)

@@ -48,18 +48,12 @@ def test_tables_hold_the_ratios(program: Any) -> None:
     rows = {
         "simulator": [row(0.5, tuned=False), row(0.25, parts={"dynamics": 0.75, "the rest": 0.25})],
         "update": [row(2.0, units=1, unit="updates", flops=10**9, dense=3 * 10**9)],
-        "brute force": [row(1.0)],
-        "points P = 16": [row(0.001)],
-        "points P = 64": [row(0.002)],
-    }
+        "brute force": [row(1.0)], "points P = 16": [row(0.001)], "points P = 64": [row(0.002)],
+    }  # fmt: skip
     machine = {"processor": "one", "cores": 2, "python": "3", "torch": "2", "symphony": "1"}
     report = {
-        "date": "2000-01-01",
-        "minutes": 1.0,
-        "machine": machine,
-        "rows": rows,
-        "start": {"a": 2.0, "b": 3.0},
-    }
+        "date": "2000-01-01", "minutes": 1.0, "machine": machine, "rows": rows, "start": {"a": 2.0, "b": 3.0},
+    }  # fmt: skip
     before = {"rows": {"simulator": [row(1.0, matmul=4e9)]}}
     text = program("tables").text(report, before)
     cells = [

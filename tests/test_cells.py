@@ -127,12 +127,10 @@ def test_acute_corners_have_the_side_that_the_distance_says(seed: int) -> None:
     start, end, previous, following = segments_of(np.concatenate(rings), np.cumsum([0, *map(len, rings)]))
     given = scene(straight_road())
     given = given.replace(
-        edge_start=torch.from_numpy(start)[None].float(),
-        edge_end=torch.from_numpy(end)[None].float(),
+        edge_start=torch.from_numpy(start)[None].float(), edge_end=torch.from_numpy(end)[None].float(),
         edge_valid=torch.ones(1, len(start), dtype=torch.bool),
-        edge_previous=torch.from_numpy(previous)[None],
-        edge_following=torch.from_numpy(following)[None],
-    )
+        edge_previous=torch.from_numpy(previous)[None], edge_following=torch.from_numpy(following)[None],
+    )  # fmt: skip
     batch, row = collate([given]), torch.zeros(1, dtype=torch.int64)
     corner = torch.from_numpy(start).float().repeat(60, 1)
     where = (corner + 1.5 * torch.from_numpy(rng.normal(size=corner.shape)).float())[None]

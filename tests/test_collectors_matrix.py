@@ -22,13 +22,10 @@ ROWS, STEPS = 3, 8
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
 ENVIRONMENTS: dict[str, Callable[[], envs.EnvBase]] = {
-    "rows": lambda: with_rows(Mass(), [ROWS]),
-    "sticky": lambda: with_rows(Mass(sticky=True), [ROWS]),
-    "own batch": lambda: Mass((ROWS,)),
-    "agents": lambda: with_rows(Mass(agents=2), [ROWS]),
-    "one": Mass,
+    "rows": lambda: with_rows(Mass(), [ROWS]), "sticky": lambda: with_rows(Mass(sticky=True), [ROWS]),
+    "own batch": lambda: Mass((ROWS,)), "agents": lambda: with_rows(Mass(agents=2), [ROWS]), "one": Mass,
     "endless": lambda: with_rows(Mass(limit=99.0), [ROWS]),
-}
+}  # fmt: skip
 OBSERVED = {"agents": ("agents", "observation")}
 TRANSFORMS: dict[str, Callable[[Any], list[envs.Transform]]] = {
     "none": lambda key: [],
@@ -191,12 +188,8 @@ def test_without_pruning_it_is_the_best_of_all_branches(valued):
 
     network = TensorDictModule(worth, ["place"], ["state_value"]) if valued else None
     how = {
-        "policy": hashed,
-        "value_network": network,
-        "rule": KeepAll(),
-        "prune_every": 2,
-        "temperature": 0.5,
-    }
+        "policy": hashed, "value_network": network, "rule": KeepAll(), "prune_every": 2, "temperature": 0.5,
+    }  # fmt: skip
     planner = BeamSearchPlanner(env, HORIZON, BRANCHES, **how)
     planned = planner(start.clone())
     expected, actions = returns(env, start, worth if valued else None)

@@ -87,14 +87,10 @@ def test_boxes_bound_their_shape(path, shape, size, place, turn):
 
 def test_the_ego_has_the_most_moving_neighbours(path: Path) -> None:
     cars = [
-        driver(5, x=500),
-        driver(9, x=30),
-        driver(8, x=0),
-        driver(6, x=75),
-        driver(3, x=20, steps=range(4)),
+        driver(5, x=500), driver(9, x=30), driver(8, x=0), driver(6, x=75), driver(3, x=20, steps=range(4)),
         obstacle(2, [state(k, 20, 3, 0, 0) for k in range(5)]),
         obstacle(4, [state(k, 10.0 + k, 3, 0, 10) for k in range(5)], kind="bicycle"),
-    ]
+    ]  # fmt: skip
     # Within 50 m, 8 has 9, 3 and 4 moving; 9 has 8, 3 and 4, and 6 besides. Without 6 they tie.
     assert convert(path, ROAD, *cars).ego == 1
     assert convert(path, ROAD, *cars[:3], *cars[4:]).ego == 2

@@ -438,16 +438,12 @@ def test_a_worker_dies(paths: list[Path], tmp_path: Path, monkeypatch: pytest.Mo
     assert content(tmp_path / "store") == content(tmp_path / "whole")
 
 
-@pytest.mark.parametrize(
-    ("what", "message"),
-    [
-        ("rate", "rate is 10.0, but the conversion that was interrupted had 5.0"),
-        ("fewer", r"the files are others, .* \(.*d\.scene\)"),
-        ("order", "in another order"),
-        ("map", r"were changed, since the conversion was interrupted \(.*b\.map\)"),
-        ("option", "options is {'option': 'option'}, but .* had {'option': 'usual'}"),
-    ],
-)
+@pytest.mark.parametrize(("what", "message"), [
+    ("rate", "rate is 10.0, but the conversion that was interrupted had 5.0"),
+    ("fewer", r"the files are others, .* \(.*d\.scene\)"), ("order", "in another order"),
+    ("map", r"were changed, since the conversion was interrupted \(.*b\.map\)"),
+    ("option", "options is {'option': 'option'}, but .* had {'option': 'usual'}"),
+])  # fmt: skip
 def test_other_arguments_do_not_go_on(paths: list[Path], tmp_path: Path, what: str, message: str) -> None:
     class WithMaps(FakeReader):
         def __init__(self, option: str = "usual") -> None:

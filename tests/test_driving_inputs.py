@@ -109,18 +109,11 @@ def test_on_a_straight_route_it_is_what_can_be_computed_by_hand() -> None:
     brake = 36.0 / (2 * 16.0)
     for k in range(3):
         expected = [
-            1.0,
-            math.tanh(gap[k] / 3),
-            math.tanh(gap[k] / 12),
-            math.tanh(gap[k] / 50),
-            math.tanh(left[k] / 1.5),
-            math.tanh(left[k] / 6),
-            math.tanh((abs(left[k]) - 2.0) / 0.5),
-            math.tanh(faster[k] / 2),
-            math.tanh(faster[k] / 8),
-            brake / (brake + 2) if k == 0 else 0.0,
+            1.0, math.tanh(gap[k] / 3), math.tanh(gap[k] / 12), math.tanh(gap[k] / 50),
+            math.tanh(left[k] / 1.5), math.tanh(left[k] / 6), math.tanh((abs(left[k]) - 2.0) / 0.5),
+            math.tanh(faster[k] / 2), math.tanh(faster[k] / 8), brake / (brake + 2) if k == 0 else 0.0,
             0.0 if k == 1 else 1.0,
-        ]
+        ]  # fmt: skip
         assert found[k].tolist() == pytest.approx(expected, abs=1e-6), k
     assert (found[3:] == 0).all()
 

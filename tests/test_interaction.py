@@ -181,9 +181,7 @@ def test_states_logged_twice(tmp_path: Path) -> None:
 
 GOOD = text(CARS)
 BROKEN = [
-    ("", "empty"),
-    (GOOD[:-1], "cut short"),
-    (GOOD.replace(",vy,", ",v,", 1), "0 columns of that name"),
+    ("", "empty"), (GOOD[:-1], "cut short"), (GOOD.replace(",vy,", ",v,", 1), "0 columns of that name"),
     (GOOD.replace(",car,", ",", 1), "10 fields, expected 11"),
     (GOOD.replace(",2.0000,", ",inf,", 1), "'inf' can't be read"),
     (GOOD.replace(",2.0000,", ",,", 1), "'' can't be read"),
@@ -195,7 +193,7 @@ BROKEN = [
     (GOOD.replace(",car,", ",truck,", 1).replace(",truck,", ",bicycle,", 1), "more than one"),
     (GOOD.replace(",4.5,2.0", ",,"), "length and width must be positive"),
     (text(track(3, x=9000)), "away from the map"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("content", "message"), BROKEN)

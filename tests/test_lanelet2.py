@@ -126,16 +126,13 @@ def test_areas_are_road_but_for_their_holes(tmp_path: Path, turned: tuple[bool, 
 
 
 BROKEN = {
-    "": "empty",
-    osm().replace("<osm", "<!DOCTYPE osm><osm", 1): "document type",
-    osm(lanelets={}): "has no lanelets",
-    osm(lanelets={105: LANELETS[105]}): "has no lanes",
+    "": "empty", osm().replace("<osm", "<!DOCTYPE osm><osm", 1): "document type",
+    osm(lanelets={}): "has no lanelets", osm(lanelets={105: LANELETS[105]}): "has no lanes",
     osm(lanelets={101: (22, 99, ROAD, ())}): "there is no way 99",
-    osm().replace("x='50'", "x='inf'", 1): "not finite",
-    osm().replace("x='50'", "", 1): "is not a number",
+    osm().replace("x='50'", "x='inf'", 1): "not finite", osm().replace("x='50'", "", 1): "is not a number",
     osm("degrees").replace("lat='49.", "lat='89.", 1): "outside latitudes",
     osm().replace("<relation id='102'", "<relation id='101'"): "two lanelets of one id",
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("content", BROKEN, ids=BROKEN.values())

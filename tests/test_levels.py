@@ -51,11 +51,9 @@ def overpass(height: float = HIGH, slope: float = 0.0, turn: float = 0.0) -> Run
     half = LANE_WIDTH / 2
     lanes = [line(0, 0, 0), line(1, 0, height)]
     boundary = [
-        line(0, -half, 0),
-        line(0, half, 0, back=True),
-        line(1, half, height),
+        line(0, -half, 0), line(0, half, 0, back=True), line(1, half, height),
         line(1, -half, height, back=True),
-    ]
+    ]  # fmt: skip
     speed, time = 10.0, 0.2 * np.arange(STEPS)
     position = np.zeros((3, STEPS, 3))
     position[0, :, 0] = position[1, :, 1] = speed * (time - 4)
@@ -72,12 +70,9 @@ def overpass(height: float = HIGH, slope: float = 0.0, turn: float = 0.0) -> Run
 
     road = make_road([lifted(each) for each in lanes], boundary=[lifted(each) for each in boundary])
     made = make_segment(
-        road,
-        lifted(position) + np.array([0, 0, 0.8]),
-        heading + turn,
-        lifted(np.pad(velocity, ((0, 0), (0, 0), (0, 1))))[..., :2],
-        segment_id=f"overpass-{height:g}",
-    )
+        road, lifted(position) + np.array([0, 0, 0.8]), heading + turn,
+        lifted(np.pad(velocity, ((0, 0), (0, 0), (0, 1))))[..., :2], segment_id=f"overpass-{height:g}",
+    )  # fmt: skip
     return validate(made)
 
 

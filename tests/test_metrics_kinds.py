@@ -41,15 +41,10 @@ def scene(log, speed, size, subject):
     rows = subject.clamp(min=0)[..., None]
     exists = (subject >= 0)[..., None].expand(*subject.shape, log.shape[-2])
     return {
-        "collided": flags,
-        "state": torch.take_along_dim(state, rows[..., None], -3),
-        "exists": exists,
-        "subject": subject,
-        "log_state": log,
-        "log_valid": valid,
-        "size": size,
+        "collided": flags, "state": torch.take_along_dim(state, rows[..., None], -3), "exists": exists,
+        "subject": subject, "log_state": log, "log_valid": valid, "size": size,
         "agent_type": torch.ones(size.shape[:-1], dtype=torch.int64),
-    }
+    }  # fmt: skip
 
 
 def kinds_of(*agents, **arguments):

@@ -102,10 +102,8 @@ def test_it_is_the_mean_cost_of_what_the_actor_drives_into(env, cost):
     counted = torch.ones(2, STEPS, 2, dtype=torch.bool)
     counted[1, 4:] = False
     wanted = {
-        "mean": costs[counted].mean(),
-        "sum": costs[counted].sum(),
-        "none": torch.where(counted, costs, 0.0),
-    }
+        "mean": costs[counted].mean(), "sum": costs[counted].sum(), "none": torch.where(counted, costs, 0.0),
+    }  # fmt: skip
     for reduction, value in wanted.items():
         out = make(env, cost=cost, reduction=reduction)(td)
         torch.testing.assert_close(out["loss_mgail"], value)

@@ -211,21 +211,17 @@ def skeleton(root: Path) -> Path:
 
 
 IMPORTS = [
-    ("geometry/a.py", "import symphony.errors", True),
-    ("geometry/b.py", "import symphony.roadgraph", False),
+    ("geometry/a.py", "import symphony.errors", True), ("geometry/b.py", "import symphony.roadgraph", False),
     ("roadgraph/a.py", "import symphony.geometry", True),
     ("roadgraph/c.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import symphony.data", True),
     ("data/c.py", "import symphony.geometry", False),
     ("envs/b.py", "def f():\n    import symphony.metrics", False),
-    ("modules/c.py", "import symphony.config", False),
-    ("objectives/b.py", "import symphony.geometry", False),
+    ("modules/c.py", "import symphony.config", False), ("objectives/b.py", "import symphony.geometry", False),
     ("render/b.py", "import symphony.metrics", False),
     ("training/a.py", "import symphony.metrics, symphony.modules, symphony.render, symphony.config", True),
-    ("training/b.py", "import symphony.cli", False),
-    ("wosac/scorer/a.py", "import symphony.errors", True),
-    ("wosac/scorer/b.py", "import symphony.data", False),
-    ("unplaced.py", "", False),
-]
+    ("training/b.py", "import symphony.cli", False), ("wosac/scorer/a.py", "import symphony.errors", True),
+    ("wosac/scorer/b.py", "import symphony.data", False), ("unplaced.py", "", False),
+]  # fmt: skip
 
 
 def test_imports_that_flow_one_way_pass_and_others_are_found(tmp_path: Path) -> None:

@@ -216,12 +216,9 @@ def test_lanes_that_do_not_meet_are_joined_without_a_jump(gap):
 def maps():
     """Graphs with every kind of junction and of change, each with the lanes it is entered by."""
     entries = {
-        crossing: "in0 in1",
-        roundabout: "entry0 between1",
-        pocket: "first second",
-        parallel: "a0 b1",
+        crossing: "in0 in1", roundabout: "entry0 between1", pocket: "first second", parallel: "a0 b1",
         merge: "a b",
-    }
+    }  # fmt: skip
     made = [(make(), names.split()) for make, names in entries.items()]
     return [(road, [name[entry] for entry in names]) for (road, name), names in made]
 

@@ -58,15 +58,13 @@ def test_reading_is_the_inverse_of_writing(segment, rollouts, seed, searched, da
     rng = np.random.default_rng(seed)
     saved = played(segment, rows, rollouts)
     saved = dataclasses.replace(
-        saved,
-        state=rng.normal(0, 50, saved.state.shape).astype("f4"),
+        saved, state=rng.normal(0, 50, saved.state.shape).astype("f4"),
         **{name: rng.random(saved.counted.shape) < 0.5 for name in ("collision", "offroad", "counted")},
         goal=rng.integers(-1, 2, saved.goal.shape),
         routes=Polylines.of([rng.normal(size=(k, 2)).astype("f4") for k in (3, 5)]),
-        drivers=tuple(f"driver {row}" for row in rows),
-        failed={0: "no plan\nfound"},
+        drivers=tuple(f"driver {row}" for row in rows), failed={0: "no plan\nfound"},
         trees=random_trees(saved, seed=seed) if searched else None,
-    )
+    )  # fmt: skip
     arrays, facts = tensors_of(saved)
     again = read_tensors(save(arrays, {KEY: json.dumps(facts)}), Path("x"), segment.segment_id)
     assert_same(saved, again)

@@ -180,34 +180,23 @@ def changed(path: str, value: Any) -> dict[str, Any]:
 STATE, LINE, LIGHTS = "tracks/ego/state/", "map_features/on/polyline", "dynamic_map_states"
 
 
-@pytest.mark.parametrize(
-    ("path", "value", "field"),
-    [
-        ("id", 7, "id"),
-        ("metadata", ..., "metadata"),
-        ("metadata/ts", np.arange(STEPS) ** 2 * 0.1, "metadata: ts"),
-        ("metadata/ts", np.full(STEPS, np.nan), "metadata: ts"),
-        ("length", 7, "metadata"),
-        ("metadata/sdc_id", "never", "metadata: sdc_id"),
-        ("metadata/map", "\ud800", "group"),
-        ("tracks", {}, "tracks"),
-        ("metadata/ts", (np.arange(STEPS) / 10).astype(str), "metadata"),
-        ("metadata/ts", np.zeros((STEPS, 2)), "metadata"),
-        (STATE + "heading", np.zeros(2 * STEPS), "tracks ego"),
-        (STATE + "heading", np.zeros((STEPS, 2)), "tracks ego"),
-        (STATE + "position", np.zeros((STEPS, 2)), "tracks ego"),
-        (STATE + "position", np.zeros((3, STEPS)), "tracks ego"),
-        (STATE + "heading", np.array(STEPS * ["a"]), "tracks ego"),
-        (STATE + "heading", np.full(STEPS, np.inf), "heading"),
-        (LINE, [[[1], [2]]], "map_features on"),
-        (LINE, [(1, 2), (1, 2, 3)], "map_features on"),
-        (LINE, np.full((2, 2), "7"), "map_features on"),
-        (LINE, [(1e9, 0)], "map_features on"),
-        (LINE, [(10**400, 0)], "map_features on"),
-        (LIGHTS, {"on": {"lane": "on", "state": {"object_state": STEPS * ["PINK"]}}}, LIGHTS),
-        (LIGHTS, {"on": {"lane": "on", "state": {"object_state": ["LANE_STATE_GO"]}}}, f"{LIGHTS} on"),
-    ],
-)
+@pytest.mark.parametrize(("path", "value", "field"), [
+    ("id", 7, "id"), ("metadata", ..., "metadata"),
+    ("metadata/ts", np.arange(STEPS) ** 2 * 0.1, "metadata: ts"),
+    ("metadata/ts", np.full(STEPS, np.nan), "metadata: ts"), ("length", 7, "metadata"),
+    ("metadata/sdc_id", "never", "metadata: sdc_id"), ("metadata/map", "\ud800", "group"),
+    ("tracks", {}, "tracks"), ("metadata/ts", (np.arange(STEPS) / 10).astype(str), "metadata"),
+    ("metadata/ts", np.zeros((STEPS, 2)), "metadata"), (STATE + "heading", np.zeros(2 * STEPS), "tracks ego"),
+    (STATE + "heading", np.zeros((STEPS, 2)), "tracks ego"),
+    (STATE + "position", np.zeros((STEPS, 2)), "tracks ego"),
+    (STATE + "position", np.zeros((3, STEPS)), "tracks ego"),
+    (STATE + "heading", np.array(STEPS * ["a"]), "tracks ego"),
+    (STATE + "heading", np.full(STEPS, np.inf), "heading"), (LINE, [[[1], [2]]], "map_features on"),
+    (LINE, [(1, 2), (1, 2, 3)], "map_features on"), (LINE, np.full((2, 2), "7"), "map_features on"),
+    (LINE, [(1e9, 0)], "map_features on"), (LINE, [(10**400, 0)], "map_features on"),
+    (LIGHTS, {"on": {"lane": "on", "state": {"object_state": STEPS * ["PINK"]}}}, LIGHTS),
+    (LIGHTS, {"on": {"lane": "on", "state": {"object_state": ["LANE_STATE_GO"]}}}, f"{LIGHTS} on"),
+])  # fmt: skip
 def test_broken_scenarios_are_refused_by_name(path: str, value: Any, field: str, tmp_path: Path) -> None:
     error = read_error("scenarionet", write(tmp_path, changed(path, value)))
     assert (error.field, error.file) == (field, tmp_path / "sd_made.pkl")
@@ -301,15 +290,11 @@ def test_code_is_refused_by_name_and_never_run(tmp_path: Path) -> None:
 
 
 OTHERS = {
-    "collections.OrderedDict": OrderedDict(a=1),
-    "path": Path("x"),
-    "builtins.len": len,
-    "numpy.random": np.random.default_rng(0),
-    "an array of type 'O8'": np.array([{}], object),
-    "an array of type 'V8'": np.zeros(2, [("a", "f8")]),
-    "an array of type 'M8'": np.zeros(2, "M8[s]"),
+    "collections.OrderedDict": OrderedDict(a=1), "path": Path("x"), "builtins.len": len,
+    "numpy.random": np.random.default_rng(0), "an array of type 'O8'": np.array([{}], object),
+    "an array of type 'V8'": np.zeros(2, [("a", "f8")]), "an array of type 'M8'": np.zeros(2, "M8[s]"),
     "an array of type 'U9999'": np.zeros(1, "U9999"),
-}
+}  # fmt: skip
 
 
 def test_other_things_are_refused_by_name(tmp_path: Path) -> None:

@@ -118,21 +118,15 @@ def network(gain: float) -> Any:
 
 
 HELD: dict[str, Any] = {
-    "number": lambda gain: gain,
-    "array": middle,
-    "tensor": lambda gain: torch.from_numpy(middle(gain)).requires_grad_(),
-    "network": network,
-    "object": lambda gain: Steady({"deep": [Steady(gain)]}),
-    "set": lambda gain: {"a", gain},
+    "number": lambda gain: gain, "array": middle,
+    "tensor": lambda gain: torch.from_numpy(middle(gain)).requires_grad_(), "network": network,
+    "object": lambda gain: Steady({"deep": [Steady(gain)]}), "set": lambda gain: {"a", gain},
     "objects": lambda gain: np.array([Steady(gain), None]),
-}
+}  # fmt: skip
 WAYS: dict[str, Any] = {
-    "object": Called,
-    "method": lambda held: Steady(held).plan,
-    "partial": lambda held: partial(steady, held),
-    "class": lambda held: partial(Steady, gain=held),
-    "closure": lambda held: lambda seen: (held, 0.0),
-}
+    "object": Called, "method": lambda held: Steady(held).plan, "partial": lambda held: partial(steady, held),
+    "class": lambda held: partial(Steady, gain=held), "closure": lambda held: lambda seen: (held, 0.0),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", HELD)
@@ -189,14 +183,10 @@ def test_a_command_that_failed_leaves_nothing_in_the_way(store: Path, run: Path,
     assert told(*command)[0] == 0
 
 
-@pytest.mark.parametrize(
-    ("body", "reason"),
-    [
-        ("__import__('sys').exit()", "called sys.exit(None)"),
-        ("(*seen.ego[:2], 2e5, 1.0)", "a heading of 200000 rad"),
-        ("missing", "missing"),
-    ],
-)
+@pytest.mark.parametrize(("body", "reason"), [
+    ("__import__('sys').exit()", "called sys.exit(None)"),
+    ("(*seen.ego[:2], 2e5, 1.0)", "a heading of 200000 rad"), ("missing", "missing"),
+])  # fmt: skip
 def test_what_a_planner_does_wrong_ends_its_run_only(store: Path, told: Any, body: str, reason: str) -> None:
     Path("mine.py").write_text(PLAN.format(body))
     code, words = told(*drive(store, "--planner", "mine.py:plan", "--out", "a"))
@@ -206,19 +196,14 @@ def test_what_a_planner_does_wrong_ends_its_run_only(store: Path, told: Any, bod
         assert Path("a/report.html").is_file()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--planner idm --planner-seconds inf", "planner-seconds must be above 0"),
-        ("--planner pipe:'foo", "No closing quotation"),
-        ("--planner idm --segments 0 0", "is named twice: 0, 0"),
-        ("--goal 7=3,4", "follows no goals"),
-        ("--device foo", "unknown device 'foo'"),
-        *((f"--planner exits{end}:plan", "SystemExit") for end in ("", ".py")),
-        *((f"--planner wrong{end}:plan", "SyntaxError") for end in ("", ".py")),
-        ("--search tree --rule math:sqrt", "can't be called as needed"),
-    ],
-)
+@pytest.mark.parametrize(("words", "message"), [
+    ("--planner idm --planner-seconds inf", "planner-seconds must be above 0"),
+    ("--planner pipe:'foo", "No closing quotation"), ("--planner idm --segments 0 0", "is named twice: 0, 0"),
+    ("--goal 7=3,4", "follows no goals"), ("--device foo", "unknown device 'foo'"),
+    *((f"--planner exits{end}:plan", "SystemExit") for end in ("", ".py")),
+    *((f"--planner wrong{end}:plan", "SyntaxError") for end in ("", ".py")),
+    ("--search tree --rule math:sqrt", "can't be called as needed"),
+])  # fmt: skip
 def test_one_line_names_the_mistake(store: Path, told: Any, words: str, message: str) -> None:
     Path("exits.py").write_text("exit()\n")
     Path("wrong.py").write_text("def plan(:\n")

@@ -406,12 +406,12 @@ def test_a_segment_that_cannot_be_scored_ends_no_others_whatever_the_workers(tmp
     whole = [crossing(num_agents=2, seed=k) for k in range(2)]
     road, walking = whole[0].road, np.full_like(whole[0].agent_type, AgentType.PEDESTRIAN)
     bare = whole[0].replace(segment_id="bare", road=replace(road, boundary=road.boundary.of([])))
-    walkers, short = whole[0].replace(segment_id="walkers", agent_type=walking), straight_road(2, steps=12)
+    walkers, short = whole[0].replace(segment_id="walkers", agent_type=walking), straight_road(2, steps=8)
     fill(tmp_path / "store", [bare, whole[0], walkers, short, whole[1]])
     agent, store, done = load_agent(RANDOM), SegmentStore(tmp_path / "store"), []
 
     def evaluated(items, seed=0, workers=1, **changes):
-        settings = replace(PLAIN, workers=workers, seed=seed)
+        settings = replace(PLAIN, workers=workers, seed=seed, horizon=2.0)
         changes |= {"baselines": False, "progress": lambda *at: done.append(at)}
         return evaluate_wosac(agent, store, items, settings, **changes)
 

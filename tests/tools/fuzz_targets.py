@@ -505,10 +505,8 @@ def _read_rollouts(folder: Path, file: str) -> tuple[str, str]:
 
 
 TARGETS: dict[str, Target] = {
-    "womd": reader("womd", _womd),
-    "commonroad": reader("commonroad", _commonroad),
-    "argoverse2": reader("argoverse2", _argoverse2),
-    "interaction": reader("interaction", _interaction),
+    "womd": reader("womd", _womd), "commonroad": reader("commonroad", _commonroad),
+    "argoverse2": reader("argoverse2", _argoverse2), "interaction": reader("interaction", _interaction),
     "test_area": reader("interaction", lambda folder: taf(folder, rows=_cars())),
     "scenarionet": reader("scenarionet", scenarionet),
     "store": Target(written(_store), _change_store, _read_store),
@@ -516,4 +514,4 @@ TARGETS: dict[str, Target] = {
     "configuration": Target(written(_configuration), _change_some, _read_configuration),
     "submission": Target(written(_submission), _change_submission, _check_submission),
     "rollouts": Target(written(_rollouts), _change_rollouts, _read_rollouts),
-}
+}  # fmt: skip

@@ -126,13 +126,9 @@ def targets(folder: Path) -> dict[str, Target]:
         kinds = (f"straight {2 * k}", f"broken {k}", f"crossing {2 * k + 1}")
         (logs / f"{k}.scene").write_text("\n".join(kinds[: 2 + k % 2]))
     work: dict[str, Callable[[Path], None]] = {
-        "generate": _generate,
-        "convert": partial(_convert, logs),
-        "train bc": partial(_train, "bc", store),
-        "train bc_ts_h": partial(_train, "bc_ts_h", store),
-        "bc by two": partial(_train_by_two, "bc", store),
-        "bc_ts_h by two": partial(_train_by_two, "bc_ts_h", store),
-        "evaluate": partial(_evaluate, store),
+        "generate": _generate, "convert": partial(_convert, logs), "train bc": partial(_train, "bc", store),
+        "train bc_ts_h": partial(_train, "bc_ts_h", store), "bc by two": partial(_train_by_two, "bc", store),
+        "bc_ts_h by two": partial(_train_by_two, "bc_ts_h", store), "evaluate": partial(_evaluate, store),
         "simulate": partial(_simulate, store),
-    }
+    }  # fmt: skip
     return {name: Target(action, files) for name, action in work.items()}

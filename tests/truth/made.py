@@ -100,10 +100,8 @@ def road(lanes: bool, boundary: bool, bridge: float, deck: float) -> RoadMap:
     lines = [*east, _line((500, WEST), (-100, WEST)), np.insert(across, 2, bridge, axis=1)]
     lines += [np.insert(_line((500, OWN), (-100, OWN)), 2, deck, axis=1)] if deck else []
     joined: dict[str, Any] = {
-        "successors": [(0, 1), (2, 3)],
-        "left": [(2, 0), (3, 1)],
-        "right": [(0, 2), (1, 3)],
-    }
+        "successors": [(0, 1), (2, 3)], "left": [(2, 0), (3, 1)], "right": [(0, 2), (1, 3)],
+    }  # fmt: skip
     found = make_road(lines, boundary=edges if boundary else [], **joined)
     # Nobody drives on lanes for bikes.
     return found if lanes else replace(found, lane_type=np.full(len(lines), LaneType.BIKE_LANE, np.uint8))
@@ -135,14 +133,9 @@ def segment_of(case: Case, dt: float, phase: float) -> tuple[RunSegment, NDArray
     for part in (position, velocity, heading):
         part[~seen] = 0
     made = make_segment(
-        road(case.lanes, case.boundary, case.bridge, case.deck),
-        position,
-        heading,
-        velocity,
-        dt,
-        case.name,
+        road(case.lanes, case.boundary, case.bridge, case.deck), position, heading, velocity, dt, case.name,
         **changes,
-    )
+    )  # fmt: skip
     place, turn, moved = case.ego.at(time)
     speed = (moved * np.stack([np.cos(turn), np.sin(turn)], -1)).sum(-1)
     return made, np.concatenate([place, turn[:, None], speed[:, None]], -1)

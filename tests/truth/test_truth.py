@@ -53,15 +53,11 @@ def kind_of(saved: SavedRollouts) -> int:
     segment, steps = saved.segment, saved.steps + 1
     pose = np.concatenate([segment.position[..., :2], segment.heading[..., None], segment.velocity], -1)
     found = collision_kinds(
-        torch.from_numpy(saved.collision[0].T),
-        torch.from_numpy(saved.state[0].swapaxes(0, 1)),
-        torch.from_numpy(saved.there[0].T),
-        torch.tensor([0]),
-        torch.from_numpy(pose[:, :steps]),
-        torch.from_numpy(segment.valid[:, :steps]),
-        torch.from_numpy(segment.size[:, :2]),
+        torch.from_numpy(saved.collision[0].T), torch.from_numpy(saved.state[0].swapaxes(0, 1)),
+        torch.from_numpy(saved.there[0].T), torch.tensor([0]), torch.from_numpy(pose[:, :steps]),
+        torch.from_numpy(segment.valid[:, :steps]), torch.from_numpy(segment.size[:, :2]),
         torch.from_numpy(segment.agent_type.astype(np.int64)),
-    )
+    )  # fmt: skip
     return int(found.kind[0])
 
 
