@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from helpers_saved import played
 from helpers_segments import crossing, make_segment, straight_road
 from helpers_store import fill
 from symphony.bench.criticality import GENTLE, HARD, LONGEST, criticality, hardest
@@ -19,6 +21,7 @@ from symphony.bench.published import PDM, comfortable, derivative
 from symphony.cli import main
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
+from symphony.saved.folder import About, save_rollouts
 
 Reals = NDArray[np.float64]
 
@@ -116,3 +119,23 @@ def test_the_hardest_come_first_and_are_listed(tmp_path: Path, capsys: Any) -> N
     assert capsys.readouterr().out.split() == [one.segment for _, one in found]
     assert main(["data", "hardest", str(tmp_path / "store"), "--json", "-"]) == 0
     assert "time_to_collision" in capsys.readouterr().out
+
+
+def test_of_rollouts_the_hardest_are_named_by_segment_and_number(tmp_path: Path, capsys: Any) -> None:
+    """The log played back is as critical as the log, one in which the ego brakes or collides is more so."""
+    segment = crossing(4, steps=30)
+    one = played(segment, rollouts=3)
+    one.state[1, 20:, 0, 3] -= 2.0  # within 0.2 s
+    one.collision[2, 9, 0] = True
+    save_rollouts(tmp_path / "sim", About("made"), [one, played(straight_road(3, steps=8))])
+    assert main(["data", "hardest", str(tmp_path / "sim"), "--count", "3", "--json", "-"]) == 0
+    brakes, hits, log = sorted(json.loads(capsys.readouterr().out), key=lambda one: (one["rollout"] - 1) % 3)
+    assert {one["segment"] for one in (brakes, hits, log)} == {segment.segment_id}
+    expected = criticality(segment)
+    numbers = [log[name] for name in ("time_to_collision", "encroachment", "braking", "margin")]
+    logged = [getattr(expected, name) for name in ("time_to_collision", "encroachment", "braking", "margin")]
+    assert numbers == pytest.approx([None if math.isinf(x) else x for x in logged], abs=1e-3)
+    assert brakes["braking"] == pytest.approx(10.0, abs=0.5)
+    assert (hits["time_to_collision"], hits["score"] > log["score"]) == (0.0, True)
+    assert main(["data", "hardest", str(tmp_path / "sim"), "--ids"]) == 0
+    assert capsys.readouterr().out.split() == [segment.segment_id, "straight-0"]

@@ -1,4 +1,4 @@
-"""How critical driving is for the ego: which run segments, or which simulated runs of them, are the hard ones.
+"""How critical driving is for the ego: which run segments, or which rollouts of them, are the hard ones.
 
 Sources: least time to collision (Hayward 1972), post-encroachment time (Allen, Shin and Cooper 1978).
 """
@@ -19,7 +19,8 @@ from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.evaluation.contacts import time_to_collision
 from symphony.geometry import levels_apart
-from symphony.saved.rollouts import World
+from symphony.saved.folder import RolloutFolder
+from symphony.saved.rollouts import SavedRollouts, World, world_of
 
 LONGEST = 3.0
 """Seconds, of time to collision and of encroachment, above which nothing is critical."""
@@ -42,6 +43,7 @@ class Criticality:
             around; infinite if they share none within :data:`LONGEST`.
         braking: most, m/s²; 0 without any.
         margin: least metres from the ego's box to the road's boundary; infinite without one.
+        rollout: number; None for the log.
     """
 
     segment: str
@@ -49,6 +51,7 @@ class Criticality:
     encroachment: float
     braking: float
     margin: float
+    rollout: int | None = None
 
     @property
     def score(self) -> float:
@@ -62,17 +65,20 @@ class Criticality:
         return sum(max(0.0, min(1.0, part)) for part in parts)
 
 
-def criticality(segment: RunSegment) -> Criticality:
-    """How critical the log of a run segment is for its ego; others on another level do not count."""
-    heights = agent_heights(segment)
-    world = World(
-        segment.position[..., :2].astype(np.float64),
-        segment.heading.astype(np.float64),
-        segment.velocity.astype(np.float64),
-        segment.valid,
-        segment.size[:, :2].astype(np.float64),
-        heights.swapaxes(0, 1) if len(heights) else None,
-    )
+def criticality(found: RunSegment | SavedRollouts, rollout: int | None = None) -> Criticality:
+    """How critical a log or a rollout is for its ego; others on another level do not count. Boxes that overlap in a
+    log are wrongly measured ones; in a rollout the ego collides, and the time to collision is 0.
+    """
+    if isinstance(found, SavedRollouts):
+        segment, world = found.segment, world_of(found, rollout or 0)
+        hits = bool((found.collision & found.counted)[rollout or 0, :, found.agents == segment.ego].any())
+    else:
+        segment, heights, hits = found, agent_heights(found), False
+        moves = (segment.position[..., :2], segment.heading, segment.velocity)
+        height = heights.swapaxes(0, 1) if len(heights) else None
+        size = segment.size[:, :2].astype(np.float64)
+        position, heading, velocity = (part.astype(np.float64) for part in moves)
+        world = World(position, heading, velocity, segment.valid, size, height)
     seen = np.flatnonzero(world.valid[segment.ego])
     slower = np.diff(world.speed[segment.ego, seen]) / (np.diff(seen) * segment.dt)
     ego = _boxes(world, np.full(len(seen), segment.ego), seen)
@@ -82,11 +88,11 @@ def criticality(segment: RunSegment) -> Criticality:
     ttc = time_to_collision(world, np.array([segment.ego]))
     return Criticality(
         segment.segment_id,
-        # Boxes that overlap in a log are wrongly measured ones.
-        float(ttc[ttc > 0].min(initial=math.inf)),
+        0.0 if hits else float(ttc[ttc > 0].min(initial=math.inf)),
         _encroachment(world, segment, seen, ego),
         float(-slower.min(initial=0.0)) + 0.0,
         float(shapely.distance(edges, ego).min(initial=math.inf)) if lines else math.inf,
+        rollout,
     )
 
 
@@ -112,9 +118,8 @@ def _encroachment(
 
 def _boxes(world: World, row: NDArray[np.int64], step: NDArray[np.int64]) -> NDArray[np.object_]:
     """Boxes of agents at steps, as polygons."""
-    x, y = (np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * 0.5 * world.size[row][:, None]).transpose(
-        2, 0, 1
-    )
+    half = 0.5 * world.size[row][:, None]
+    x, y = (np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half).transpose(2, 0, 1)
     cos, sin = (part(world.heading[row, step])[:, None] for part in (np.cos, np.sin))
     turned = np.stack([x * cos - y * sin, x * sin + y * cos], -1)
     polygons: NDArray[np.object_] = shapely.polygons(world.position[row, step][:, None] + turned)
@@ -122,18 +127,19 @@ def _boxes(world: World, row: NDArray[np.int64], step: NDArray[np.int64]) -> NDA
 
 
 def hardest(
-    store: SegmentStore,
+    source: SegmentStore | RolloutFolder,
     count: int,
     items: Sequence[int] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[tuple[int, Criticality]]:
-    """So many of the most critical run segments of a store (or of these rows of it), the hardest first; equal ones in
-    their order. ``progress`` is called with the segments looked at and their total.
+    """So many of the most critical run segments of a store (or of these rows of it), or rollouts of a folder, the
+    hardest first; equal ones in their order. ``progress`` is called with the segments looked at and their total.
     """
-    rows = range(len(store)) if items is None else items
-    found = []
+    rows, found = range(len(source)) if items is None else items, list[tuple[int, Criticality]]()
     for number, row in enumerate(rows):
-        found.append((row, criticality(store[row])))
+        one = source[row]
+        runs = range(one.rollouts) if isinstance(one, SavedRollouts) else [None]
+        found += [(row, criticality(one, k)) for k in runs]
         if progress is not None:
             progress(number + 1, len(rows))
     return sorted(found, key=lambda one: -one[1].score)[:count]

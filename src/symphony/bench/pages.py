@@ -16,10 +16,8 @@ WORST = 20
 """Bad runs of a pair that are named, at most."""
 LEAD = 2.0
 """Seconds before the first event of a run at which its replay begins."""
-SHOWN = (
-    *("score", "pdm_score", "at_fault_collision_rate", "collision_rate", "red_light_rate", "offroad_rate"),
-    *("progress_ratio", "max_braking", "failed_rate"),
-)
+SHOWN = ["score", "pdm_score", "at_fault_collision_rate", "collision_rate", "red_light_rate", "offroad_rate"]
+SHOWN += ["progress_ratio", "max_braking", "failed_rate"]
 """Measures in the table of the page."""
 
 _STYLE = """

@@ -28,12 +28,8 @@ ROUNDS = 4
 """Parts in which the segments of a pair are simulated; after each the verdict may be clear."""
 DROP = 10.0
 """Points of score that a run must lose against the baseline's to be called a regression."""
-EVENTS = {
-    "failed": "fails",
-    "at_fault_collision": "collides, at fault",
-    "red_lights": "runs a red light",
-    "offroad_time": "leaves the road",
-}
+EVENTS = {"failed": "fails", "at_fault_collision": "collides, at fault"}
+EVENTS |= {"red_lights": "runs a red light", "offroad_time": "leaves the road"}
 """What a run of the baseline's did not show, for a regression; in words."""
 
 Status = Literal["passes", "fails", "undecided"]

@@ -232,19 +232,15 @@ class Doctor(shared.Command):
         began, second = time.perf_counter(), symphony.EvaluateConfig(rollouts=2, branches=2, duration=1)
         test = symphony.builtin_store("test")
         numbers = symphony.evaluate("pretrained:bc_ts_h", test, second, items=[0]).numbers()
-        seconds = time.perf_counter() - began
+        spent, held = time.perf_counter() - began, {one.name: one.version for one in distributions()}
         devices = [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
         found: dict[str, Any] = {
             "symphony": {"version": symphony.__version__, "at": symphony.__file__},
             "python": {"version": platform.python_version(), "at": sys.executable},
             "system": {"kernel": platform.platform(), "cores": os.cpu_count(), "CUDA devices": devices},
-            "packages": {name: _installed(name) for name in PACKAGES.split()},
-            "extras": {name: _installed(name) for name in EXTRAS.split()},
-            "simulation": {"rollouts": numbers["rollouts"], "seconds": seconds, "ADE": numbers["ade"]},
+            "packages": {name: held.get(name, "not installed") for name in PACKAGES.split()},
+            "extras": {name: held.get(name, "not installed") for name in EXTRAS.split()},
+            "simulation": {"rollouts": numbers["rollouts"], "seconds": spent, "ADE": numbers["ade"]},
         }
         if shared.write_numbers(self.json, found):
             shared.print_facts(found)
-
-
-def _installed(package: str) -> str:
-    return next((found.version for found in distributions(name=package)), "not installed")

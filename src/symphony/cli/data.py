@@ -108,31 +108,33 @@ class Quality(shared.Command):
 
 
 class Hardest(shared.Command):
-    """List the run segments of a store that are most critical for the ego, the hardest first.
+    """List the run segments of a store, or the rollouts in a folder, that are most critical for the ego.
 
-    Four things make a segment critical, each with up to one point: a short time to collision, a short time between
-    the ego and another who crosses its way, hard braking, and a small distance to the road's boundary.
+    The hardest come first. Four things make one critical, each with up to one point: a short time to collision, a
+    short time between the ego and another who crosses its way, hard braking, a small distance to the road's boundary.
     """
 
-    store: shared.Store
-    count: Count = 20  # Number of run segments that are listed.
-    ids: bool = False  # Print only their ids, for the option --segments of other commands.
+    store: Annotated[Positional[Path], arg(metavar="DIR")]  # Folder of the store, or of rollouts.
+    count: Count = 20  # Number of run segments, or of rollouts, that are listed.
+    ids: bool = False  # Print only the ids of their segments, for the option --segments of other commands.
     json: shared.Json = None
 
     def __call__(self) -> None:
         from symphony.bench.criticality import hardest
+        from symphony.saved.folder import MANIFEST, load_rollouts
 
-        store = symphony.SegmentStore(self.store)
-        with shared.progress("looking at the log") as advance:
-            found = [one for _, one in hardest(store, self.count, progress=advance)]
+        opened = load_rollouts if (self.store / MANIFEST).is_file() else symphony.SegmentStore
+        with shared.progress("looking at each") as advance:
+            found = [one for _, one in hardest(opened(self.store), self.count, progress=advance)]
         told = shared.write_numbers(self.json, [{**asdict(one), "score": one.score} for one in found])
         if self.ids:
-            shared.say("\n".join(one.segment for one in found))
+            shared.say("\n".join(dict.fromkeys(one.segment for one in found)))
         elif told:
-            rows = [["segment", "critical", "TTC s", "PET s", "braking m/s²", "to the edge m"]]
+            rows = [["segment", "rollout", "critical", "TTC s", "PET s", "braking m/s²", "to the edge m"]]
             for one in found:
                 numbers = (one.score, one.time_to_collision, one.encroachment, one.braking, one.margin)
-                rows.append([one.segment, *("–" if math.isinf(n) else f"{n:.2f}" for n in numbers)])
+                cells = ("–" if math.isinf(n) else f"{n:.2f}" for n in numbers)
+                rows.append([one.segment, "log" if one.rollout is None else str(one.rollout), *cells])
             shared.print_table(rows, heads=1)
 
 
