@@ -12,14 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from symphony.geometry import rotate
-from symphony.metrics import (
-    Choice,
-    choices,
-    jensen_shannon,
-    route_turns,
-    sampled_divergence,
-    sampling_floor,
-)
+from symphony.metrics import Choice, choices, jensen_shannon, route_turns, sampled_divergence, sampling_floor
 from symphony.metrics.choices import choice_numbers
 
 BINS = 15

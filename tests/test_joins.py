@@ -32,11 +32,7 @@ def links(road: RoadMap) -> set[tuple[int, int]]:
     return {(a, b) for a, b in road.successors.tolist()}
 
 
-@given(
-    st.lists(st.floats(0.05, 1.4), min_size=1, max_size=6),
-    st.floats(-3, 3),
-    st.integers(0, 2**16),
-)
+@given(st.lists(st.floats(0.05, 1.4), min_size=1, max_size=6), st.floats(-3, 3), st.integers(0, 2**16))
 def test_a_road_cut_into_pieces_is_whole_again(gaps: list[float], angle: float, seed: int) -> None:
     """Gaps along a curve, the lanes in any order, the world turned in any way."""
     rng = np.random.default_rng(seed)

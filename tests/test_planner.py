@@ -96,7 +96,7 @@ def simulated(make: Any, count: int = 2, **settings: Any) -> Any:
     data = dataset(count)
     egos = EgoPlanners("mine", make, [data.segment(i) for i in range(count)])
     config = EvaluateConfig(**{"rollouts": 4, "search": "none", **settings})
-    return simulation(small(), data.scenes(range(count)), config, egos=egos, keep_tree=True)
+    return simulation(small(), data.scenes(range(count)), config, egos=[egos], keep_tree=True)
 
 
 TREE: dict[str, Any] = {"search": "tree", "branches": 6, "rule": "best", "prune_every": 5}
@@ -241,7 +241,7 @@ def test_nobody_plans_beyond_the_end_of_a_segment_beside_a_longer_one(tmp_path: 
     data = SceneDataset(SegmentStore(tmp_path / "store"), 2, small().dynamics, routes=True)
     egos = EgoPlanners("mine", partial(FunctionPlanner, noted), segments)
     config = EvaluateConfig(rollouts=1, search="none")
-    assert simulation(small(), data.scenes(range(2)), config, egos=egos).failed == ({}, {})
+    assert simulation(small(), data.scenes(range(2)), config, egos=[egos]).failed == ({}, {})
     assert asked == {s.segment_id: list(range(s.num_steps - 1)) for s in segments}
 
 
@@ -396,7 +396,7 @@ def driven(*segments: RunSegment, planner: Any = "idm") -> Simulation:
     """The ego by a planner, everyone else as logged."""
     scenes = collate([scene(one, [one.ego], LaneGraph(one.road)) for one in segments])
     egos = EgoPlanners("mine", planner_maker(planner), list(segments))
-    return simulation(load_agent("playback"), scenes, EvaluateConfig(rollouts=1), egos=egos)
+    return simulation(load_agent("playback"), scenes, EvaluateConfig(rollouts=1), egos=[egos])
 
 
 def states(*segments: RunSegment, planner: Any = "idm") -> Any:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,8 @@ from symphony.errors import ConfigError, DataError
 from symphony.evaluation.planners import paired_difference, planner_record, planners_text, run_score, winners
 from symphony.learning.demonstrations import SceneDataset
 from symphony.planners.interface import Control, Pose, Scenario, Traffic, checked_plan
-from symphony.planners.view import Observation
+from symphony.planners.view import FunctionPlanner, Observation
+from symphony.rollouts.crowd import crowd_dataset
 from symphony.saved.folder import RolloutFolder, load_rollouts
 from symphony.saved.saving import save_simulation
 
@@ -93,9 +96,9 @@ def run(store: Path, out: Path, planner: Any, agent: str = "", **settings: Any) 
     known = load_agent(agent) if agent else small()
     count = 1 if known.policy is None else 2
     data = SceneDataset(SegmentStore(store), count, known.dynamics, routes=True, duration=2)
-    seconds = settings.pop("planner_seconds", 60.0)
+    how = {name: settings.pop(name) for name in ("planner_seconds", "drives") if name in settings}
     config = EvaluateConfig(**{"rollouts": 2, "search": "none", **settings})
-    return save_simulation(out, known, data, config, planner=planner, planner_seconds=seconds)
+    return save_simulation(out, known, data, config, planner=planner, **how)
 
 
 def alone(store: Path, out: Path, planner: Any, **settings: Any) -> RolloutFolder:
@@ -243,17 +246,12 @@ FINE = dict.fromkeys(
 
 
 @pytest.mark.parametrize(("changes", "score"), [
-    ({}, 50.0),
-    ({"progress_ratio": 1.4}, 100.0),
-    ({"progress_ratio": -0.1}, 0.0),
-    ({"progress_ratio": None}, 100.0),
+    ({}, 50.0), ({"progress_ratio": 1.4}, 100.0), ({"progress_ratio": -0.1}, 0.0), ({"progress_ratio": None}, 100.0),
     ({"progress_ratio": None, "beyond_route": 1, "no_route": 0}, None),
     ({"progress_ratio": None, "beyond_route": 0, "no_route": 1}, None),
     ({"progress_ratio": None, "beyond_route": 1, "at_fault_collision": True}, 0.0),
     ({"progress_ratio": None, "beyond_route": None, "failed": "why"}, 0.0),
-    ({"collision": True}, 50.0),
-    ({"red_lights": 1}, 0.0),
-    ({"offroad_time": 2.0}, 0.0),
+    ({"collision": True}, 50.0), ({"red_lights": 1}, 0.0), ({"offroad_time": 2.0}, 0.0),
 ])  # fmt: skip
 def test_the_score_of_a_run(changes: dict[str, Any], score: float | None) -> None:
     assert run_score({**FINE, "progress_ratio": 0.5, **changes}) == score
@@ -275,6 +273,8 @@ def test_the_command_compares_planners_among_crowds(store, tmp_path, capsys):
     assert sorted(line.split("|")[2].strip() for line in table[2:4]) == ["idm", "log"]
     assert table[-1] == winners(records)[0]
     assert main(["planners", str(store)]) == 1
+    with pytest.raises(DataError, match="no planner drove here"):
+        planner_record(run(store, tmp_path / "bare", ""))
 
 
 def test_a_segment_that_failed_is_no_recording_of_its_own(tmp_path: Path) -> None:
@@ -320,7 +320,73 @@ def test_runs_without_defined_progress_have_no_score(tmp_path: Path) -> None:
     assert winners([other, record])[0].startswith("log: hurries is first, within the error, –")
 
 
-def test_a_folder_without_a_planner_is_refused(store: Path, tmp_path: Path) -> None:
-    folder = run(store, tmp_path / "sim", "")
-    with pytest.raises(DataError, match="no planner drove here"):
-        planner_record(folder)
+def several(out: Path, segment: RunSegment, planner: Any, drives: Any, agent: Any = "playback", **how: Any):
+    """Rollouts in which agents beside the ego have planners of their own."""
+    fill(out / "store", [segment])
+    data, known = SegmentStore(out / "store"), load_agent(agent)
+    config = EvaluateConfig(**{"rollouts": 1, "duration": 2, **how})
+    scenes = crowd_dataset(data, known, config, default=1, routes=True, also=tuple(drives))
+    return save_simulation(out / "sim", known, scenes, config, planner=planner, drives=drives)[0]
+
+
+@pytest.mark.parametrize("planner", ["idm", brakes])
+def test_an_agent_is_driven_alike_whoever_is_the_ego(planner: Any, tmp_path: Path) -> None:
+    """By a planner of its own beside an ego that plays back its log, or as the ego itself."""
+    segment = straight_road(4, steps=11)
+    beside = several(tmp_path / "a", segment, "log", {int(segment.agent_id[2]): planner})
+    alone = several(tmp_path / "b", segment.replace(ego=2, segment_id="own"), planner, {})
+    assert (beside.agents.tolist(), beside.drivers) == ([segment.ego, 2], ("log", *alone.drivers))
+    np.testing.assert_allclose(beside.state[0, :, 1], alone.state[0, :, 0], atol=1e-3)
+    np.testing.assert_allclose(beside.state[0, :, 0, :2], segment.position[segment.ego, :11, :2], atol=1e-3)
+    assert np.abs(np.diff(alone.state[0, :, 0, 3])).max() > 0
+
+
+TREE = {"search": "tree", "branches": 6, "prune_every": 4, "score": "flags"}
+
+
+@pytest.mark.parametrize("search", [{}, TREE])
+def test_two_planners_each_see_the_scene_from_their_own_seat(search: Any, tmp_path: Path) -> None:
+    """And draw numbers of their own; a search copies both with its branches."""
+
+    class Wanders:
+        def reset(self, scenario: Scenario) -> None:
+            self.rng, self.me, self.at = np.random.default_rng(scenario.seed), scenario.ego, scenario.state
+
+        def plan(self, seen: Traffic) -> Pose:
+            assert (seen.ego, np.abs(seen.state - self.at).max() < 1e-3) == (self.me, True), "another's"
+            assert sorted(np.abs(seen.position[list(ends)] - self.at[:2]).max(1) > 1) == [False, True]
+            self.at = self.at + np.array([2.0 + self.rng.random(), 0.0, 0.0, 0.0])
+            ends[self.me].append(self.at[0])
+            return Pose(*self.at)
+
+    segment, ends = straight_road(4, steps=11), {0: list[float](), 2: list[float]()}
+    drives = {int(segment.agent_id[2]): Wanders}
+    saved = several(tmp_path, segment, Wanders, drives, AGENT, rollouts=2, **search)
+    assert saved.failed == {}
+    for place, row in enumerate(ends):
+        assert np.abs(np.subtract.outer(saved.state[:, 1:, place, 0], ends[row])).min(-1).max() < 1e-3
+    steps = np.concatenate([np.diff(ends[row]) for row in ends])
+    assert len(np.unique(steps.round(6))) == len(steps), "planners draw alike"
+
+
+def test_planners_of_others_fail_by_their_name_and_what_can_not_be_is_told(store, tmp_path, capsys):
+    late = partial(FunctionPlanner, lambda seen: (0.0, 0.0) if seen.step < 3 else None)
+    segment = crossing(4, steps=11)
+    saved = several(tmp_path, segment, "log", {(agent := int(segment.agent_id[1])): late})
+    assert saved.failed[0].startswith(f"agent {agent}, step 3: ")
+    assert saved.counted[0].sum(0).tolist() == [3, 3]
+    words = f"simulate playback --data {tmp_path / 'store'} --duration 2 --out {tmp_path / 'out'} --planner"
+    for given, status, why in (
+        ("3=idm", 1, "the ego has one planner, there is none"),
+        ("idm log", 1, "2 are named: idm, log"),
+        (f"idm {agent}=log {agent}=idm", 1, f"agent {agent} has another one"),
+        (f"idm {agent}=no.py:plan", 1, "no such file"),
+        (f"idm {agent}=log --goal {agent}=1,2", 1, f"a planner drives agent {agent}"),
+        ("idm 99=log", 3, "99: not all are ids of vehicles beside the ego"),
+        (f"log {agent}=idm", 0, ""),
+    ):
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        assert main([*words.split(), *given.split()]) == status
+        assert why in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="agent 7, which has a planner, is not driven"):
+        run(store, tmp_path / "x", "log", drives={7: "log"})

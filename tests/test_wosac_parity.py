@@ -10,12 +10,7 @@ import torch
 
 from symphony.wosac.files import read_rollouts
 from symphony.wosac.records import logged_scenario, parse_scenario, read_scenarios
-from symphony.wosac.scorer import (
-    CHALLENGES,
-    Component,
-    compute_features,
-    score_features,
-)
+from symphony.wosac.scorer import CHALLENGES, Component, compute_features, score_features
 from symphony.wosac.scorer.boxes import Boxes, distance_to_nearest, time_to_collision
 from symphony.wosac.scorer.features import speed
 from symphony.wosac.scorer.lights import Lanes, Signals, red_light_violations

@@ -10,8 +10,8 @@ Key = str | tuple[str, ...]
 SCENE: Key = "scene"  # [..., 1] int64: row of the environment's scene batch
 STEP: Key = "step"  # [..., 1] int64: simulated steps since the first state
 STREAM: Key = "stream"  # [..., 1] int64: identity of the rollout, from which all its random numbers derive
-PLANNER: Key = "planner"  # [..., 1] int64: number of the planner that drives the ego of the rollout
-PLANNED: Key = "planned"  # [..., 4]: x, y, heading, speed that a planner gives the ego at the next step
+PLANNER: Key = "planner"  # [..., P] int64: numbers of the planners that drive the first agents of the rollout
+PLANNED: Key = "planned"  # [..., P, 4]: x, y, heading, speed that planners give these at the next step
 NOISE_PLAN: Key = "noise_plan"  # [..., T, N] or [..., T, N, 2]: NOISE of all steps of a rollout
 
 # Padding is not valid; in open traffic neither are agents that are not there yet (they are waiting) or no more.

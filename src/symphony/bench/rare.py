@@ -102,7 +102,7 @@ class Hunt:
         with naming(self.dataset, items):
             scenes = self.dataset.scenes(items).to(torch.device(config.device))
             segments = [self.dataset.segment(i) for i in items]
-            egos = EgoPlanners(name, planner_maker(self.planner), segments)
+            egos = [EgoPlanners(name, planner_maker(self.planner), segments)]
             found = simulate_batch(agent, scenes, config, keep_tree=True, egos=egos, toward=Nearness)
             assert found.search is not None  # noqa: S101 - as asked for
             weight = leaf_weights(found.search).cpu().numpy()

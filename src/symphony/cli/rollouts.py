@@ -24,9 +24,10 @@ class Simulate(shared.Simulation):
 
     out: Path  # Folder of the rollouts.
     #: Planner that drives the ego, while the agent drives the other interactive agents: `idm`, `log`, or one of your
-    #: own: a file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. With `playback`
-    #: as the agent all others play back the log. There is no search unless --search, --branches or --trees say so.
-    planner: str = ""
+    #: own: a file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. Then planners of
+    #: other agents, by their ids in the source: `3=idm`. With `playback` as the agent all others play back the log.
+    #: There is no search unless --search, --branches or --trees say so.
+    planner: Annotated[tuple[str, ...], arg(metavar="NAME [ID=NAME ...]")] = ()
     planner_seconds: float = 60.0  # Seconds that a planner has for one answer; a longer one fails the run.
     #: Number of runs to simulate (a run is one rollout of one segment) in place of `rollouts`: evenly spread over the
     #: segments, a few more where the number can't be divided so. 0: all segments, `rollouts` of each.
@@ -43,23 +44,25 @@ class Simulate(shared.Simulation):
 
     def __call__(self) -> None:
         from symphony.learning.demonstrations import evenly_spaced
+        from symphony.planners.interface import named_planners
         from symphony.rollouts.crowd import crowd_dataset
         from symphony.rollouts.driving import beside_planner, spread_runs
         from symphony.saved.saving import save_simulation
 
         agent = symphony.load_agent(self.agent, self.config.device, trust_code=self.trust_code)
-        store, planner, goals = symphony.SegmentStore(self.data), self.planner, self.goal
+        store, (planner, drives) = symphony.SegmentStore(self.data), named_planners(self.planner)
         config = beside_planner(self.config) if planner else self.config
         chosen = shared.segment_indices(store, self.segments)
         if self.runs:
             count, config = spread_runs(agent, config, self.runs, len(store))
             chosen = evenly_spaced(len(store), count)
         # Beside log playback nobody else is simulated.
-        crowd = {"default": 1 if planner and agent.policy is None else agent.interactive}
-        dataset = crowd_dataset(store, agent, config, chosen or None, routes=bool(planner or goals), **crowd)
-        how: dict[str, Any] = {"planner": planner, "planner_seconds": self.planner_seconds, "goals": goals}
+        crowd: dict[str, Any] = {"default": 1 if planner and agent.policy is None else agent.interactive}
+        crowd |= {"routes": bool(planner or self.goal), "also": drives}
+        dataset = crowd_dataset(store, agent, config, chosen or None, **crowd)
+        how: dict[str, Any] = {"planner": planner, "drives": drives, "goals": self.goal}
         with shared.progress(f"simulating {agent.name}") as advance:
-            how |= {"keep_tree": self.tree, "progress": advance}
+            how |= {"keep_tree": self.tree, "planner_seconds": self.planner_seconds, "progress": advance}
             found = save_simulation(self.out, agent, dataset, config, **how)
         shared.say(f"{len(found)} run segments in {self.out}: symphony view {self.out}")
         why = [f"{saved.segment.segment_id}, {reason}" for saved in found for reason in saved.failed.values()]
@@ -159,8 +162,7 @@ class Export(shared.Command):
     """Write saved rollouts in a format of other tools, a file for each."""
 
     folder: shared.Saved
-    #: Format of the files: CommonRoad scenarios (XML 2020a, .xml), or JSON.
-    format: Literal["commonroad", "json"] = "commonroad"
+    format: Literal["commonroad", "json"] = "commonroad"  # Format: CommonRoad scenarios (XML 2020a), or JSON.
     out: shared.Folder = None  # Folder of the files; by default the folder `export` within SIM.
     segments: shared.Segments = ()
     #: Numbers of the rollouts to export of each run segment, counted from 0; by default all.

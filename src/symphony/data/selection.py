@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -254,6 +254,17 @@ def interactive_choice(segment: RunSegment, count: int, *, fewer: bool = False) 
         message = f"needs {count} interactive agents at its first step, has {has}"
         raise DataError(message, file=segment.file or None, segment=segment.segment_id, field="agents")
     return InteractiveChoice(np.asarray(chosen[:count], np.int64), context)
+
+
+def named_vehicles(segment: RunSegment, ids: Sequence[int]) -> list[int]:
+    """The rows of vehicles beside the ego by their ids; a DataError if one is not seen at the first step."""
+    found = [int(row) for agent in ids for row in np.flatnonzero(segment.agent_id == agent)]
+    free = (segment.agent_type[found] == AgentType.VEHICLE) & segment.valid[found, 0]
+    if len(found) < len(ids) or segment.ego in found or not free.all():
+        who = ", ".join(map(str, ids))
+        text = f"{who}: not all are ids of vehicles beside the ego that are seen at the first step"
+        raise DataError(text, segment=segment.segment_id, field="agent_id")
+    return found
 
 
 def interactive_agents(segment: RunSegment, count: int) -> NDArray[np.int64]:

@@ -25,13 +25,23 @@ from symphony.envs.routes import ONWARD, SPACING
 from symphony.errors import ConfigError
 from symphony.planners.calls import SECONDS, answer, plans_of
 from symphony.planners.included import IDMPlanner
-from symphony.planners.interface import Planner, Traffic, checked_plan, fixed, scenario_of
+from symphony.planners.interface import (
+    Planner,
+    Planners,
+    Traffic,
+    checked_plan,
+    fixed,
+    planner_maker,
+    planner_name,
+    scenario_of,
+)
 from symphony.streams import Stream, fold_in
 
 
 class PlannedEnv(DrivingEnv):
-    """Driving in which actions are not all: background agents go where ``BACKGROUND`` says, and the first interactive
-    agent, the ego, where ``PLANNED`` does; where there is no such entry, they act like the others.
+    """Driving in which actions are not all: background agents go where ``BACKGROUND`` says, and the first P
+    interactive agents, the ego and others with planners, where ``PLANNED`` does; where there is no such entry, they
+    act like the others.
     """
 
     def _moved(self, tensordict: TensorDictBase, state: Tensor, size: Tensor) -> Tensor:
@@ -40,7 +50,7 @@ class PlannedEnv(DrivingEnv):
         if ruled is not None:
             background = self.scenes.background[tensordict.get(keys.SCENE).squeeze(-1)]
             after = torch.where(background[..., None], ruled, after)
-        return after if planned is None else torch.cat([planned[..., None, :], after[..., 1:, :]], -2)
+        return after if planned is None else torch.cat([planned, after[..., planned.shape[-2] :, :]], -2)
 
 
 class Failure(NamedTuple):
@@ -51,12 +61,12 @@ class Failure(NamedTuple):
 
 
 class EgoPlanners(NamedTuple):
-    """How the egos of a batch are planned.
+    """How one agent of each scene of a batch is planned: the ego, or another, which is the ego of its planner.
 
     Attributes:
         name: of the planner.
         make: makes one.
-        segments: behind the scenes, in their order; the first interactive agent of each is its ego.
+        segments: behind the scenes, in their order.
         seconds: that a planner has for one answer.
     """
 
@@ -66,58 +76,39 @@ class EgoPlanners(NamedTuple):
     seconds: float = SECONDS
 
 
-class RuledEgo(TensorDictModuleBase):
-    """Writes the states that a rule for background agents leads the egos to as ``PLANNED``.
+def ego_planners(
+    planners: Planners,
+    segments: Sequence[RunSegment],
+    interactive: Int[Tensor, "B N"],
+    seconds: float,
+) -> list[EgoPlanners]:
+    """How the first interactive agents of scenes are planned, given the rows of all of them in their segments.
 
-    Args:
-        env: the environment.
-        rule: made with an environment and the parameters, it writes ``BACKGROUND``.
-        driver: the parameters, of all egos.
-        start: [...] states at which rollouts begin; each names its scene as its planner.
+    Raises:
+        ConfigError: in some segment another agent has the place of one with a planner.
     """
-
-    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID]  # noqa: RUF012 - the type declared
-    out_keys = [keys.PLANNED]  # noqa: RUF012
-
-    def __init__(
-        self,
-        env: DrivingEnv,
-        rule: Callable[[PlannedEnv, IDMPlanner], TensorDictModuleBase],
-        driver: IDMPlanner,
-        start: TensorDictBase,
-    ) -> None:
-        super().__init__()
-        scenes = env.scenes.clone(recurse=False)
-        scenes.background = torch.zeros_like(scenes.background).index_fill(
-            1, scenes.interactive.new_zeros(1), 1
-        )
-        self.rule = rule(PlannedEnv(scenes, env.dynamics, ObservationConfig.nothing()), driver)
-        self.lost = scenes.route_logged[:, 0] < 0
-        start.set(keys.PLANNER, start.get(keys.SCENE).clone())
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write planned states [..., 4]."""
-        moved = self.rule(tensordict.select(*self.in_keys)).get(keys.BACKGROUND)
-        return tensordict.set(keys.PLANNED, moved[..., 0, :])
-
-    def failures(self, number: Int[Tensor, "*b"]) -> list[Failure | None]:
-        """The failures of egos in these scenes, flattened: those on no lane fail from the first step on."""
-        failure = Failure(0, "reset: the ego is on no lane that it could follow")
-        return [failure if lost else None for lost in self.lost[number.flatten()].tolist()]
+    found = []
+    for place, (agent, planner) in enumerate(planners.items()):
+        for segment, row in zip(segments, interactive[:, place].tolist(), strict=True):
+            if row != segment.ego if agent is None else segment.agent_id[row] != agent:
+                who = "the ego" if agent is None else f"agent {agent}"
+                raise ConfigError(f"segment {segment.segment_id}: {who}, which has a planner, is not driven")
+        found.append(EgoPlanners(planner_name(planner), planner_maker(planner), segments, seconds))
+    return found
 
 
 class EgoPolicy(TensorDictModuleBase):
-    """Asks the planners and writes the states they lead to as ``PLANNED``.
+    """Asks planners and writes the states they lead to as ``PLANNED``: of the first interactive agents, one each.
 
-    Rollouts name their planner by number (``PLANNER``). Copies of a branch share a number until they are driven on;
+    Rollouts name their planners by number (``PLANNER``). Copies of a branch share a number until they are driven on;
     then each gets a planner of its own, copied before any of them plans.
 
     Args:
         env: the environment.
-        egos: how egos are planned.
-        start: [...] states at which planners begin, the egos on the routes of the log; each gets its number.
+        egos: how the first interactive agents are planned.
+        start: [...] states at which planners begin, the agents on the routes of the log; each gets its numbers.
         seed: of all rollouts.
-        first: the planner of the first rollout, or the exception that making it ended with.
+        rule: made with an environment and the parameters of an IDM that has no ``plan`` of its own, it drives.
         forked: a search will copy planners with its branches.
 
     Raises:
@@ -130,58 +121,146 @@ class EgoPolicy(TensorDictModuleBase):
     def __init__(
         self,
         env: DrivingEnv,
-        egos: EgoPlanners,
+        egos: Sequence[EgoPlanners],
         start: TensorDictBase,
         seed: int,
-        first: Planner | Exception,
+        rule: Callable[[PlannedEnv, IDMPlanner], TensorDictModuleBase],
         *,
         forked: bool = False,
     ) -> None:
         super().__init__()
-        self.env, self.egos = env, egos
-        numbers = torch.arange(start.numel(), device=start.device)
-        start.set(keys.PLANNER, numbers.reshape(*start.shape, 1))
+        self.drivers: list[_Ruled | _Asked] = []
+        for place, one in enumerate(egos):
+            first = answer(one.make, seconds=one.seconds)
+            if isinstance(first, IDMPlanner) and not callable(getattr(first, "plan", None)):
+                self.drivers.append(_Ruled(env, one, place, rule, first))
+            else:
+                self.drivers.append(_Asked(env, one, place, start, seed, first, forked=forked))
+        start.set(keys.PLANNER, torch.cat([one.begin(start) for one in self.drivers], -1))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write planned states [..., P, 4] and numbers of planners [..., P]."""
+        numbers = tensordict.get(keys.PLANNER).unbind(-1)
+        moved = [one.moved(tensordict, number) for one, number in zip(self.drivers, numbers, strict=True)]
+        states, numbers = zip(*moved, strict=True)
+        tensordict.set(keys.PLANNED, torch.stack(states, -2))
+        return tensordict.set(keys.PLANNER, torch.stack(numbers, -1))
+
+    def failures(self, number: Int[Tensor, "*b P"]) -> list[Failure | None]:
+        """The first failure of the planners with these numbers, flattened; None where all of them drive on."""
+        each = (one.failures(part) for one, part in zip(self.drivers, number.unbind(-1), strict=True))
+        return [min(filter(None, found), default=None) for found in zip(*each, strict=True)]
+
+
+class _Driver:
+    """Of each scene the agent at a place among the interactive ones: its row, and words before its failures."""
+
+    def __init__(self, env: DrivingEnv, egos: EgoPlanners, place: int) -> None:
+        self.env, self.egos, self.place = env, egos, place
+        self.rows = env.scenes.interactive[:, place].tolist()
+        named = zip(egos.segments, self.rows, strict=True)
+        self.who = [f"agent {one.agent_id[row]}, " if place else "" for one, row in named]
+
+
+class _Ruled(_Driver):
+    """Agents that go where a rule for background agents leads them; the number of a planner is its scene's."""
+
+    def __init__(
+        self,
+        env: DrivingEnv,
+        egos: EgoPlanners,
+        place: int,
+        rule: Callable[[PlannedEnv, IDMPlanner], TensorDictModuleBase],
+        driver: IDMPlanner,
+    ) -> None:
+        super().__init__(env, egos, place)
+        scenes = env.scenes.clone(recurse=False)
+        background = torch.zeros_like(scenes.background)
+        scenes.background = background.index_fill(1, scenes.interactive.new_tensor([place]), 1)
+        self.rule = rule(PlannedEnv(scenes, env.dynamics, ObservationConfig.nothing()), driver)
+        self.lost = scenes.route_logged[:, place] < 0
+
+    def begin(self, start: TensorDictBase) -> Tensor:
+        """The numbers [..., 1] of the planners."""
+        return start.get(keys.SCENE).clone()
+
+    def moved(self, tensordict: TensorDictBase, number: Tensor) -> tuple[Tensor, Tensor]:
+        """Planned states [..., 4] and numbers of planners [...]."""
+        moved = self.rule(tensordict.select(*self.rule.in_keys)).get(keys.BACKGROUND)
+        return moved[..., self.place, :], number
+
+    def failures(self, number: Int[Tensor, "*b"]) -> list[Failure | None]:
+        """The failures of agents in these scenes, flattened: those on no lane fail from the first step on."""
+        rows, why = number.flatten().tolist(), "reset: the ego is on no lane that it could follow"
+        lost = self.lost.tolist()
+        return [Failure(0, f"{self.who[row]}{why}") if lost[row] else None for row in rows]
+
+
+class _Asked(_Driver):
+    """Agents whose planners are asked, one for each rollout."""
+
+    def __init__(
+        self,
+        env: DrivingEnv,
+        egos: EgoPlanners,
+        place: int,
+        start: TensorDictBase,
+        seed: int,
+        first: Any,
+        *,
+        forked: bool,
+    ) -> None:
+        super().__init__(env, egos, place)
         self._last = env.scenes.last_step.cpu().numpy()
         self._held: dict[int, Planner | Failure] = {}
         scene = start.get(keys.SCENE).flatten().tolist()
-        state = start.get(keys.STATE)[..., 0, :].reshape(-1, 4).cpu().numpy()
-        stream = fold_in(fold_in(start.get(keys.STREAM), Stream.PLANNERS), seed).flatten().tolist()
+        state = start.get(keys.STATE)[..., place, :].reshape(-1, 4).cpu().numpy()
+        own = fold_in(fold_in(start.get(keys.STREAM), Stream.PLANNERS), seed)
+        # Planners of one rollout draw apart; the ego's as where it is the only one.
+        own = fold_in(own, env.scenes.interactive[start.get(keys.SCENE), place]) if place else own
+        stream = own.flatten().tolist()
         self._routes = [self._route(row) for row in range(len(egos.segments))]
         for number, row in enumerate(scene):
-            made = scenario_of(
-                egos.segments[row], self._routes[row], state[number], stream[number] & (2**63 - 1)
-            )
+            begin, drawn = state[number], stream[number] & (2**63 - 1)
+            made = scenario_of(egos.segments[row], self.rows[row], self._routes[row], begin, drawn)
             planner: Any = answer(egos.make, seconds=egos.seconds) if number else first
             error = planner if isinstance(planner, Exception) else None
             error = error or answer(planner.reset, made, seconds=egos.seconds)
             failed = isinstance(error, Exception)
-            self._held[number] = Failure(0, f"reset: {_words(error)}") if failed else planner
+            self._held[number] = self._failure(row, 0, "reset", error) if failed else planner
         self._next = len(scene)
         drives = next((held for held in self._held.values() if not isinstance(held, Failure)), None)
         if forked and drives is not None:
             self._copy(drives)
 
+    def _failure(self, row: int, step: int, when: str, error: Exception) -> Failure:
+        return Failure(step, f"{self.who[row]}{when}: {_words(error)}")
+
+    def begin(self, start: TensorDictBase) -> Tensor:
+        """The numbers [..., 1] of the planners."""
+        return torch.arange(start.numel(), device=start.device).reshape(*start.shape, 1)
+
     def _route(self, row: int) -> NDArray[np.float32]:
-        """Points [P, 2] of the route that the ego of a scene takes; none if it is on no lane."""
-        which = int(self.env.scenes.route_logged[row, 0])
+        """Points [P, 2] of the route that the agent of a scene takes; none if it is on no lane."""
+        which = int(self.env.scenes.route_logged[row, self.place])
         if which < 0:
             return np.zeros((0, 2), np.float32)
-        return self.env.scenes.whole_route(row, 0, which).cpu().numpy()
+        return self.env.scenes.whole_route(row, self.place, which).cpu().numpy()
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write planned states [..., 4] and numbers of planners [..., 1]."""
-        scene, at, number = (tensordict.get(key).flatten() for key in (keys.SCENE, keys.STEP, keys.PLANNER))
+    def moved(self, tensordict: TensorDictBase, number: Tensor) -> tuple[Tensor, Tensor]:
+        """Planned states [..., 4] and numbers of planners [...]."""
+        scene, at, place = *(tensordict.get(key).flatten() for key in (keys.SCENE, keys.STEP)), self.place
         state, valid, progress = (
             tensordict.get(key).flatten(0, tensordict.ndim - 1)
             for key in (keys.STATE, keys.VALID, keys.PROGRESS)
         )
         everyone = self.env.objects(scene, at, state, valid)
-        rows, steps, come = scene.tolist(), at.tolist(), progress[:, 0].tolist()
-        # An ego that has left the map is over, too.
-        last, there = self._last[rows].tolist(), valid[:, 0].tolist()
+        rows, steps, come = scene.tolist(), at.tolist(), progress[:, place].tolist()
+        # One that has left the map is over, too.
+        last, there = self._last[rows].tolist(), valid[:, place].tolist()
         going = [step < end and here for step, end, here in zip(steps, last, there, strict=True)]
-        numbers = self._own(number.tolist(), going)
-        own = state[:, 0].cpu().double()
+        numbers = self._own(number.flatten().tolist(), going)
+        own = state[:, place].cpu().double()
         moves, present = everyone.state.cpu().double().numpy(), everyone.valid.cpu().numpy()
         asked: list[tuple[int, Planner, Traffic]] = []
         for m, row in enumerate(rows):
@@ -199,16 +278,15 @@ class EgoPolicy(TensorDictModuleBase):
             if not isinstance(given, Exception):
                 found = answer(checked_plan, given, seen.state, self.env.dt)
             if isinstance(found, Exception):
-                self._held[numbers[m]] = Failure(steps[m], f"step {steps[m]}: {_words(found)}")
+                self._held[numbers[m]] = self._failure(rows[m], steps[m], f"step {steps[m]}", found)
             else:
                 (control if len(found) == 2 else target)[m] = found
-        length = [float(self.egos.segments[row].size[self.egos.segments[row].ego, 0]) for row in rows]
+        length = [float(self.egos.segments[row].size[self.rows[row], 0]) for row in rows]
         pulled, turned = torch.from_numpy(control).unbind(-1)
         after = bicycle_step(own, pulled, turned, torch.tensor(length, dtype=torch.float64), self.env.dt)
         wanted = torch.from_numpy(target)
         after = torch.where(wanted.isnan(), after, wanted).to(state)
-        tensordict.set(keys.PLANNED, after.reshape(*tensordict.shape, 4))
-        return tensordict.set(keys.PLANNER, number.new_tensor(numbers).reshape(*tensordict.shape, 1))
+        return after.reshape(*tensordict.shape, 4), number.new_tensor(numbers).reshape(tensordict.shape)
 
     def failures(self, number: Int[Tensor, "*b"]) -> list[Failure | None]:
         """The failures of the planners with these numbers, flattened; None for those that drive on."""
@@ -254,7 +332,7 @@ class EgoPolicy(TensorDictModuleBase):
         return Traffic(
             step=step,
             time=step * self.env.dt,
-            ego=segment.ego,
+            ego=self.rows[row],
             state=fixed(own),
             position=fixed(moves[:, :2]),
             heading=fixed(moves[:, 2]),
@@ -265,22 +343,6 @@ class EgoPolicy(TensorDictModuleBase):
             lights=fixed(segment.signal_state[:, step]),
             route=fixed(route),
         )
-
-
-def ego_policy(
-    env: DrivingEnv,
-    egos: EgoPlanners,
-    start: TensorDictBase,
-    seed: int,
-    rule: Callable[[PlannedEnv, IDMPlanner], TensorDictModuleBase],
-    *,
-    forked: bool = False,
-) -> EgoPolicy | RuledEgo:
-    """What moves the egos: a rule with the parameters of an IDM that has no ``plan`` of its own, or planners."""
-    first = answer(egos.make, seconds=egos.seconds)
-    if isinstance(first, IDMPlanner) and not callable(getattr(first, "plan", None)):
-        return RuledEgo(env, rule, first, start)
-    return EgoPolicy(env, egos, start, seed, first, forked=forked)
 
 
 def route_from(route: NDArray[np.float32], progress: float) -> NDArray[np.float64]:

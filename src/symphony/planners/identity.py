@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor, nn
 
-from symphony.planners.interface import PIPE, planner_maker
+from symphony.planners.interface import PIPE, Planners, planner_maker, planner_name
 from symphony.planners.view import FunctionPlanner
 
 _PLACE = re.compile(" at 0x[0-9A-Fa-f]+")
@@ -47,6 +47,19 @@ def source_of(planner: str | Callable[..., Any]) -> str:
     bound += _content(held) if held else ""
     code = _code_of(given)
     return _short((code + bound).encode()) if bound else code
+
+
+def planner_settings(planners: Planners, seconds: float) -> dict[str, Any]:
+    """What tells a simulation with planners, which have so many seconds for an answer, from others.
+
+    Raises:
+        ConfigError: there is no such planner, or it can't be made.
+    """
+    for one in planners.values():
+        planner_maker(one)
+    others = {str(k): [planner_name(one), source_of(one)] for k, one in planners.items() if k is not None}
+    found = {"planner": source_of(planners[None]), "planner_seconds": seconds} if planners else {}
+    return found | ({"drives": others} if others else {})
 
 
 def _content(value: Any, inside: tuple[int, ...] = ()) -> str:

@@ -10,7 +10,7 @@ import inspect
 import math
 import shlex
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -23,6 +23,10 @@ from symphony.errors import ConfigError
 from symphony.imports import load_object
 
 Reals = NDArray[np.float64]
+Named = str | Callable[..., Any]
+"""A planner by its name, or what makes it."""
+Planners = Mapping[int | None, Named]
+"""Planners by the ids of the agents that they drive, that of the ego, None, first."""
 
 MAX_ACCELERATION, MAX_BRAKING = 5.0, 10.0
 """m/s^2 that a vehicle gains and loses at most, whatever it is asked for."""
@@ -210,6 +214,29 @@ def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
     return given
 
 
+def named_planners(words: Sequence[str]) -> tuple[str, dict[int, str]]:
+    """The planner of the ego, empty for none, and of others by their ids, from such as ``idm`` and ``3=my.py:plan``.
+
+    Raises:
+        ConfigError: two of one agent, or others' without one of the ego.
+    """
+    egos, others = list[str](), dict[int, str]()
+    for word in words:
+        agent, _, name = word.partition("=")
+        if not agent.removeprefix("-").isdecimal():
+            egos.append(word)
+        elif others.setdefault(int(agent), name) != name or not name:
+            raise ConfigError(f"planner '{word}': agent {agent} has another one")
+    if len(egos) > 1 or (others and not egos):
+        told = (
+            f"{len(egos)} are named: {', '.join(egos)}"
+            if egos
+            else "there is none (`log` plays back its log)"
+        )
+        raise ConfigError(f"the ego has one planner, {told}; another agent's is such as 3=idm, by its id")
+    return "".join(egos), others
+
+
 def planner_name(planner: str | Callable[..., Any]) -> str:
     """The name of a planner in records."""
     if isinstance(planner, str):
@@ -229,9 +256,11 @@ def _needed(function: Callable[..., Any]) -> list[str]:
     return [one.name for one in found if one.kind in by_place and one.default is one.empty]
 
 
-def scenario_of(segment: RunSegment, route: NDArray[Any], state: NDArray[Any], seed: int) -> Scenario:
-    """The scenario of a run segment, for a route [P, 2], the first state [4] of the ego and a seed."""
-    ego, valid = segment.ego, segment.valid[segment.ego]
+def scenario_of(
+    segment: RunSegment, ego: int, route: NDArray[Any], state: NDArray[Any], seed: int
+) -> Scenario:
+    """The scenario of an agent of a run segment, for a route [P, 2], its first state [4] and a seed."""
+    valid = segment.valid[ego]
     heading, velocity = segment.heading[ego].astype(np.float64), segment.velocity[ego].astype(np.float64)
     speed = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
     position = segment.position[ego, :, :2].astype(np.float64)

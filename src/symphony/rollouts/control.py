@@ -32,13 +32,13 @@ def tempered(temperature: float) -> TensorDictModule:
 
 
 def given_goals(
-    goals: Sequence[str], segments: Sequence[RunSegment], scenes: SceneBatch, *, planned: bool = False
+    goals: Sequence[str], segments: Sequence[RunSegment], scenes: SceneBatch, *, planned: int = 0
 ) -> Int[Tensor, "B N"]:
     """Numbers of the routes that agents are to follow, -1 where that is left open.
 
     A goal is such as ``7=lane:103``, for agent 7 a route over the lane of id 103, or ``7=12.5,-40``, one that comes
     past a point in the frame of the segment; the nearest of the agent's feasible routes. Each must suit all segments
-    behind the scenes. An ego that a planner drives takes none.
+    behind the scenes. The first agents, so many of them ``planned``, take none.
 
     Raises:
         ConfigError: a goal that can't be read, names an agent that is not driven or has one already, or a lane that
@@ -55,8 +55,8 @@ def given_goals(
             place = [n for n in driven.nonzero()[:, 0].tolist() if int(scenes.interactive[b, n]) in rows]
             if not place:
                 raise ConfigError(f"goal '{goal}': segment {segment.segment_id} has no driven agent {agent}")
-            if planned and rows[0] == segment.ego:
-                raise ConfigError(f"goal '{goal}': agent {agent} is the ego, which a planner drives")
+            if place[0] < planned:
+                raise ConfigError(f"goal '{goal}': a planner drives agent {agent}")
             if int(found[b, place[0]]) >= 0:
                 raise ConfigError(f"goal '{goal}': agent {agent} has been given another one")
             away = _distances(scenes, b, place[0], shapely.points(_place(goal, where, segment)))

@@ -19,7 +19,7 @@ from symphony.agents import Agent
 from symphony.config import EvaluateConfig
 from symphony.config.evaluation import MOST, TOGETHER
 from symphony.data.segment import AgentType, RunSegment
-from symphony.data.selection import MOVING, interactive_choice, travel
+from symphony.data.selection import MOVING, interactive_choice, named_vehicles, travel
 from symphony.data.store import SegmentStore
 from symphony.envs.routes import route_table
 from symphony.envs.scene import SceneBatch, beyond, map_edge, scene
@@ -38,7 +38,8 @@ class Crowd:
     """Which agents of a segment are driven: so many by the agent at most, those that move, or everyone who moves or
     stands in a lane. Those beyond :data:`PAIR` must come within a radius of the ego in the log (metres; 0 for no
     limit). In open traffic they enter and leave. Where there is a background, the other vehicles are driven, too, by
-    a rule, up to :data:`MOST` with these; along routes, vehicles that are on no lane play back the log.
+    a rule, up to :data:`MOST` with these; along routes, vehicles that are on no lane play back the log. Those
+    ``also`` driven, by ids, come after the ego, beside the others.
     """
 
     count: int
@@ -47,6 +48,7 @@ class Crowd:
     open_traffic: bool = False
     background: bool = False
     along_routes: bool = False
+    also: tuple[int, ...] = ()
 
     def choose(self, segment: RunSegment, graph: LaneGraph) -> tuple[Indices, Indices]:
         """Rows of A: those that the agent drives, the ego first, and background agents.
@@ -56,7 +58,7 @@ class Crowd:
         then by their distance.
 
         Raises:
-            DataError: the ego is not seen at the first step, or in open traffic never within the map.
+            DataError: the ego or one of those is not seen at the first step, or in open traffic never within the map.
         """
         there = segment.valid
         if self.open_traffic:
@@ -66,8 +68,10 @@ class Crowd:
             raise DataError("the ego is never within the map", segment=segment.segment_id, field="ego")
         early = early[there[early].any(1)]
         order = [*early[:PAIR], *early[PAIR:][self._near(segment, early[PAIR:])]]
-        if len(order) >= self.count and not self.background:
-            return np.array(order[: self.count], np.int64), np.zeros(0, np.int64)
+        order = list(dict.fromkeys([*order[:1], *named_vehicles(segment, self.also), *order]))
+        count = self.count + len(self.also)
+        if len(order) >= count and not self.background:
+            return np.array(order[:count], np.int64), np.zeros(0, np.int64)
         vehicle, moves = (segment.agent_type == AgentType.VEHICLE) & there.any(1), travel(segment) > MOVING
         stands = vehicle & ~moves & _in_lane(segment, graph)
         first = there.argmax(1)
@@ -76,7 +80,7 @@ class Crowd:
         if not self.open_traffic:
             rest = rest[(first[rest] == 0) & stands[rest]]
         rest = rest[self._near(segment, rest)]
-        driven = np.array([*order, *(rest if self.everyone else rest[moves[rest]])], np.int64)[: self.count]
+        driven = np.array([*order, *(rest if self.everyone else rest[moves[rest]])], np.int64)[:count]
         if not self.background:
             return driven, np.zeros(0, np.int64)
         others = [agent for agent in (*order, *rest) if agent not in driven]
@@ -135,17 +139,18 @@ def crowd_dataset(
     *,
     default: int | None = None,
     routes: bool = False,
+    also: Sequence[int] = (),
 ) -> CrowdDataset:
     """The scenes that a configuration asks for, of all or some rows of a store; a :class:`DataWarning` if its
     generation is not finished. Where the configuration leaves that open, there are ``default`` interactive agents, or
-    as many as the agent was trained with; ``routes``: also for an agent that follows none.
+    as many as the agent was trained with; ``routes``: also for an agent that follows none; ``also``: see Crowd.
     """
     if store.unfinished is not None:
         warnings.warn(f"{store.path} {store.unfinished}", DataWarning, stacklevel=2)
     everyone, rule = config.interactive == "all", config.others != "log"
     count = MOST if config.interactive == "all" else config.interactive or default or agent.interactive
     in_open = config.open_traffic or everyone or rule
-    crowd = Crowd(count, everyone, config.radius, in_open, rule, along_routes=config.others == "idm")
+    crowd = Crowd(count, everyone, config.radius, in_open, rule, config.others == "idm", tuple(also))
     seconds, keep = config.duration or agent.duration, config.batch or TOGETHER
     routes = agent.routed or routes
     return CrowdDataset(store, crowd, agent.dynamics, indices, routes=routes, duration=seconds, keep=keep)

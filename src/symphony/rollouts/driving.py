@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -24,7 +24,7 @@ from symphony.errors import ConfigError
 from symphony.learning.experts import logged, logged_heights
 from symphony.metrics import collisions
 from symphony.modules import SeededNoise
-from symphony.planners.driver import EgoPlanners, EgoPolicy, PlannedEnv, RuledEgo, ego_policy
+from symphony.planners.driver import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.rollouts.background import CarFollower, constant_speed
 from symphony.rollouts.control import tempered
 from symphony.rollouts.search import going_back, pruning_rule, search
@@ -71,13 +71,13 @@ def simulation(
     config: EvaluateConfig,
     *,
     keep_tree: bool = False,
-    egos: EgoPlanners | None = None,
+    egos: Sequence[EgoPlanners] = (),
     given: Int[Tensor, "B N"] | None = None,
     toward: Callable[[PlannedEnv, TensorDictBase], Any] | None = None,
 ) -> Simulation:
     """K rollouts of every scene, and how they came about: of a search with the pruned branches, if asked for.
 
-    ``egos`` plan the first agent of every scene, which no search scores; the agent drives the others. ``given`` are
+    ``egos`` plan the first agents of every scene, which no search scores; the agent drives the others. ``given`` are
     the numbers of the routes that agents are to follow, -1 where that is left open. ``toward`` makes, with the
     environment and the first states, a module of the policy whose ``value`` of states a search lowers, not a score.
 
@@ -89,10 +89,12 @@ def simulation(
     """
     _check_given(agent, scenes, config, given)
     scenes, config = _ruled(agent, scenes, config, given) if agent.rule else (scenes, config)
-    # Beside log playback there is the ego of a planner alone: a policy whose actions nobody looks at will do.
+    # Beside log playback there are planners alone: a policy whose actions nobody looks at will do.
     policy = ConstantVelocity(Bicycle()) if agent.policy is None else agent.policy
-    if agent.policy is None and int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > 1:
-        raise ConfigError("beside log playback the planner's ego is the only interactive agent")
+    if agent.policy is None and int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > len(
+        egos
+    ):
+        raise ConfigError("beside log playback those with a planner are the only interactive agents")
     agent.check_step(float(scenes.dt[0]))
     env = PlannedEnv(scenes, agent.dynamics, agent.observation)
     kind, trees, branches, taken, settings = agent.plan(config)
@@ -103,7 +105,7 @@ def simulation(
     scorer = None if asked is None else NaNGuard(env, asked, [keys.SCORE], "discriminator", scores=True)
 
     def fixed(scene: Tensor, goal: Tensor) -> Tensor:
-        return _fixed(scenes, scene, goal, given, along_log=config.others == "idm", ego=egos is not None)
+        return _fixed(scenes, scene, goal, given, along_log=config.others == "idm", planned=len(egos))
 
     def renewed(state: TensorDictBase) -> TensorDictBase:
         if goals is None or config.logged_goals:
@@ -121,15 +123,12 @@ def simulation(
         goals_per=settings.goals,
         fix=fixed,
     )
-    planned = None
-    actor = _acting(guard, env, config)
-    if egos is not None and kind == "backtrack":
+    if egos and kind == "backtrack":
         raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
-    if egos is not None:
-        planned = ego_policy(env, egos, start, config.seed, CarFollower, forked=searches)
-        actor = TensorDictSequential(actor, planned)
-    lure = None if toward is None else toward(env, start)
-    actor = actor if lure is None else TensorDictSequential(actor, lure)
+    planned = EgoPolicy(env, egos, start, config.seed, CarFollower, forked=searches) if egos else None
+    lure, actor = None if toward is None else toward(env, start), _acting(guard, env, config)
+    for module in (planned, lure):
+        actor = actor if module is None else TensorDictSequential(actor, module)
     # The rollouts [B, trees, taken] that count, of all branches.
     chosen, tree = torch.arange(taken, device=env.device).expand(len(scenes), trees, -1), None
     if not searches:
@@ -150,7 +149,7 @@ def simulation(
                 rule=rule,
                 prune_every=settings.prune_every,
                 score=settings.score,
-                ego=planned is None,
+                planned=len(egos),
                 also=() if planned is None else (keys.PLANNER,),
                 leaves=None if kind == "best" else taken,
                 keep_tree=keep_tree and kind == "tree",
@@ -186,7 +185,7 @@ def simulate_batch(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, **h
     """Simulate an agent: :func:`playback` of the log, or a :func:`simulation`, whose arguments these are, with
     collisions found between states, too.
     """
-    if agent.policy is not None or how.get("egos") is not None:
+    if agent.policy is not None or how.get("egos"):
         found = simulation(agent, scenes, config, **how)
         between = between_states(scenes, found.rollouts.state, existing(scenes, found.rollouts))
         return found._replace(rollouts=found.rollouts._replace(collision=between))
@@ -230,10 +229,10 @@ def _check_given(
 
 
 def _fixed(
-    scenes: SceneBatch, row: Tensor, goal: Tensor, given: Tensor | None, *, along_log: bool, ego: bool
+    scenes: SceneBatch, row: Tensor, goal: Tensor, given: Tensor | None, *, along_log: bool, planned: int
 ) -> Tensor:
-    """Goals [*b, N] that agents follow in rows [*b] of the scenes instead of drawn ones: background agents and the
-    ego those of the log, if asked for, others those that are given.
+    """Goals [*b, N] that agents follow in rows [*b] of the scenes instead of drawn ones: the first ones, which are
+    planned, and background agents, if asked for, those of the log, others those that are given.
     """
     followed = scenes.route_logged[row]
     if along_log:
@@ -241,12 +240,12 @@ def _fixed(
     if given is not None:
         goal = torch.where(given.to(goal.device)[row] >= 0, given.to(goal.device)[row], goal)
     # Scenes without routes have no number of one either.
-    along = ego and scenes.route_point.shape[1]
-    return torch.cat([followed[..., :1], goal[..., 1:]], -1) if along else goal
+    along = planned * bool(scenes.route_point.shape[1])
+    return torch.cat([followed[..., :along], goal[..., along:]], -1)
 
 
-def _without_failed(found: Simulation, planned: EgoPolicy | RuledEgo, number: Tensor) -> Simulation:
-    """Steps after a planner, number [B, K, 1], failed don't count."""
+def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Simulation:
+    """Steps after a planner, numbers [B, K, P], failed don't count."""
     each, steps = [planned.failures(row) for row in number], found.rollouts.counted.shape[-2]
     until = [[steps if one is None else one.step for one in row] for row in each]
     going = torch.arange(steps, device=number.device) < torch.tensor(until, device=number.device)[..., None]

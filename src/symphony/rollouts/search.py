@@ -96,10 +96,10 @@ def realism_score(
     discriminator: TensorDictModuleBase | None,
     *,
     score: Score = "discriminator",
-    ego: bool = True,
+    planned: int = 0,
 ) -> Callable[[TensorDictBase], Tensor]:
     """A function that scores states [..., N], by the discriminator or by what agents do; 0 for background agents, and
-    for the first agent if the ego is not to be scored.
+    for so many first agents, which are planned.
     """
     learned = KeyScore(keys.SCORE, discriminator, valid_key=keys.VALID) if score == "discriminator" else None
 
@@ -109,7 +109,7 @@ def realism_score(
         else:
             found = flag_score(state) if score == "flags" else rule_score(env, state)
         found = found.masked_fill(env.scenes.background[state.get(keys.SCENE).squeeze(-1)], 0.0)
-        return found if ego else torch.cat([torch.zeros_like(found[..., :1]), found[..., 1:]], -1)
+        return torch.cat([torch.zeros_like(found[..., :planned]), found[..., planned:]], -1)
 
     return of_scored
 
@@ -176,7 +176,7 @@ def search(
     rule: PruningRule | Backtrack,
     prune_every: int,
     score: Score = "discriminator",
-    ego: bool = True,
+    planned: int = 0,
     also: Sequence[keys.Key] = (),
     value: Callable[[TensorDictBase], Tensor] | None = None,
     **returned: Any,
@@ -193,7 +193,7 @@ def search(
         return beam_search(
             env,
             TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
-            realism_score(env, discriminator, score=score, ego=ego) if value is None else no_score,
+            realism_score(env, discriminator, score=score, planned=planned) if value is None else no_score,
             start,
             value=value,
             prune_last=value is None,

@@ -18,9 +18,9 @@ from symphony.config import EvaluateConfig
 from symphony.errors import DataError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.planners.calls import SECONDS
-from symphony.planners.driver import EgoPlanners
-from symphony.planners.identity import source_of
-from symphony.planners.interface import planner_maker, planner_name
+from symphony.planners.driver import ego_planners
+from symphony.planners.identity import planner_settings
+from symphony.planners.interface import Named, Planners, planner_name
 from symphony.rollouts.control import given_goals
 from symphony.rollouts.driving import beside_planner, simulate_batch
 from symphony.rollouts.workers import batches, naming, segments_together, shared
@@ -38,29 +38,30 @@ def save_simulation(
     config: EvaluateConfig,
     *,
     keep_tree: bool = True,
-    planner: str | Callable[..., Any] = "",
+    planner: Named = "",
     planner_seconds: float = SECONDS,
+    drives: Planners | None = None,
     goals: Sequence[str] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RolloutFolder:
     """Simulate an agent on every run segment of a dataset, which has routes if there are goals or a planner, and keep
     the rollouts, and on demand all branches of the search, in a folder. What was cut short goes on where it stopped.
 
-    A planner (see :func:`symphony.planners.interface.planner_maker`) drives the ego, the agent the other interactive
-    agents, without a search unless one is asked for. More than ``planner_seconds`` for an answer fails the run.
-    Segments whose ego can't be driven are put on record as failed. Goals of agents are those of
+    A planner (see :func:`symphony.planners.interface.planner_maker`) drives the ego, others those that they are to
+    drive, by the ids that the dataset has ``also`` (:class:`symphony.rollouts.crowd.Crowd`), the agent the other
+    interactive agents, without a search unless one is asked for. More than ``planner_seconds`` for an answer fails
+    the run. Segments in which a planner has nobody to drive are put on record as failed. Goals are those of
     :func:`symphony.rollouts.control.given_goals`. ``progress`` is called with the segments done and their total.
 
     Raises:
         DataError: the folder holds something else, or the disk refuses.
         ConfigError: the agent can't be simulated so, or a goal can't be reached.
     """
-    if planner:
-        planner_maker(planner)  # or complain before anything is simulated
-        config = beside_planner(config)
+    planners: Planners = {None: planner, **(drives or {})} if planner else {}
+    config = beside_planner(config) if planner else config
     settings = plain_settings(config, agent, dataset.interactive, dataset.duration)
     settings |= {"goal": list(goals)} if goals else {}
-    settings |= {"planner": source_of(planner), "planner_seconds": planner_seconds} if planner else {}
+    settings |= planner_settings(planners, planner_seconds)  # complains before anything is simulated
     name = planner_name(planner) if planner else ""
     about = About.of(agent.name, dataset.store, settings, seed=config.seed, planner=name)
     with RolloutWriter(path, about) as writer:
@@ -69,7 +70,7 @@ def save_simulation(
         if planner:
             todo = [i for i in todo if has_ego(writer, dataset, i, config.rollouts)]
         done = len(names) - len(todo)
-        drive = partial(_drive, agent, dataset, config, keep_tree, planner, planner_seconds, tuple(goals))
+        drive = partial(_drive, agent, dataset, config, keep_tree, planners, planner_seconds, tuple(goals))
         most = PLANNED if planner and not config.batch else len(names)
         together = min(segments_together(agent, config, dataset.interactive), max(most, 1))
         with closing(shared(drive, batches(todo, together, config), config, dataset)) as results:
@@ -86,21 +87,19 @@ def _drive(
     dataset: SceneDataset,
     config: EvaluateConfig,
     keep_tree: bool,
-    planner: str | Callable[..., Any],
+    planners: Planners,
     planner_seconds: float,
     goals: Sequence[str],
     items: list[int],
 ) -> list[SavedRollouts]:
-    """Rollouts of an agent on a batch of run segments, of each, with a planner as the ego if one is named."""
+    """Rollouts of an agent on a batch of run segments, of each, with planners of the first agents, by id."""
     with naming(dataset, items):
         scenes = dataset.scenes(items).to(torch.device(config.device))
         segments = [dataset.segment(i) for i in items]
         drivers = [PLAYBACK if agent.policy is None else agent.name] * scenes.interactive.shape[1]
-        given = given_goals(goals, segments, scenes, planned=bool(planner)) if goals else None
-        egos = None
-        if planner:
-            drivers[0] = planner_name(planner)
-            egos = EgoPlanners(drivers[0], planner_maker(planner), segments, planner_seconds)
+        given = given_goals(goals, segments, scenes, planned=len(planners)) if goals else None
+        egos = ego_planners(planners, segments, scenes.interactive, planner_seconds)
+        drivers[: len(egos)] = [one.name for one in egos]
         found = simulate_batch(agent, scenes, config, keep_tree=keep_tree, egos=egos, given=given)
         rollouts, on_cpu = found.rollouts.cpu(), scenes.cpu()
         about: dict[str, Any] = {"goal": found.goal, "driver": drivers, "others": config.others}
