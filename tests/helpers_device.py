@@ -24,6 +24,7 @@ from torch.utils.backend_registration import (
     _DummyPrivateUse1Hook,
     _setup_privateuseone_for_python_backend,
 )
+from torchrl.data import Composite, Unbounded
 
 from symphony.envs import DrivingEnv
 from symphony.geometry import frames as constants
@@ -138,6 +139,9 @@ def on(device: PretendDevice, given: Any) -> Any:
         return moved(given)
     if isinstance(given, DrivingEnv):
         given._scenes = on(device, given.scenes)
+        if not given.dynamics.discrete:  # TorchRL looks at the numbers of bounds
+            n = given.num_agents
+            given.action_spec = Composite(agents=Composite(action=Unbounded((n, 2)), shape=(n,)))
         return given.to(device.device)
     if isinstance(given, nn.Module):
         for module in given.modules():

@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 import torch
 
+from helpers_segments import crossing, straight_road
+from helpers_store import fill
 from symphony.modules import mlp, pool_elements
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -93,3 +95,18 @@ def test_a_step_and_an_update_start_no_more_operators_than_they_did(program: Any
     assert step.total() - step["environment"] <= 200
     assert launches.of_a_search_step(compiled=True).total() <= 40
     assert launches.of_an_update("bc") <= 3700
+
+
+def test_reinforcement_learning_is_recorded(program: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    learning = program("reinforcement")
+    store = fill(tmp_path / "store", [straight_road(4), crossing(4)]).path
+    monkeypatch.setattr(learning, "builtin_store", lambda split: store)
+    monkeypatch.setattr(learning, "SHOWN", (0,))
+    runs = {method: [learning.run(method, seed, batches=2) for seed in (0, 1)] for method in learning.METHODS}
+    for one, other in runs.values():
+        assert all(
+            0 < m < 2560 * 8 and 0 <= crashes <= 256 for m, crashes in (*one["batches"], one["unseen"])
+        )
+        assert one != other
+    record = learning.record(runs)
+    assert [len(row) for row in record["rows"]] == [len(record["columns"])] * 4

@@ -14,19 +14,12 @@ from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import BatchSizeTransform
 from torchrl.envs.utils import RandomPolicy, check_env_specs
+from torchrl.modules import AdditiveGaussianModule
 
 from helpers_segments import crossing, straight_road
-from symphony import keys
+from symphony import DrivingEnv, ObservationConfig, keys
 from symphony.data.segment import Polylines, RunSegment
-from symphony.envs import (
-    Bicycle,
-    ConstantVelocity,
-    Displacement,
-    DrivingEnv,
-    ObservationConfig,
-    collate,
-    scene,
-)
+from symphony.envs import Bicycle, ConstantVelocity, Displacement, collate, scene
 from symphony.envs import flags as module
 from symphony.envs.flags import collision_flags
 from symphony.envs.objects import Objects
@@ -65,6 +58,19 @@ def run(env: DrivingEnv, start: TensorDict, plan: torch.Tensor) -> TensorDict:
 def test_torchrl_accepts_the_environment(dynamics, shape):
     env = make_env(dynamics=dynamics)
     check_env_specs(env, tensordict=env.reset(TensorDict(batch_size=shape)), break_when_any_done="both")
+
+
+def test_displacements_are_bounded_at_any_time_step():
+    env = make_env(dynamics=Displacement())
+    scenes = env.scenes.clone()
+    for _ in range(2):
+        spec, one = env.full_action_spec[keys.ACTION], torch.ones(2, 1)
+        torch.testing.assert_close(spec.low, env.dt * torch.tensor([-10.0, -15.0]) * one)
+        torch.testing.assert_close(spec.high, env.dt * torch.tensor([50.0, 15.0]) * one)
+        scenes.dt = scenes.dt / 2
+        env.scenes = scenes
+    noisy = AdditiveGaussianModule(spec=env.full_action_spec, action_key=keys.ACTION)
+    assert env.full_action_spec.is_in(noisy(TensorDict({"agents": {"action": torch.full((2, 2), 99.0)}})))
 
 
 def test_a_fixed_batch_runs_in_torchrls_collector():
@@ -390,9 +396,7 @@ def test_a_grid_without_a_middle_is_refused(name, count):
 
 @pytest.mark.parametrize("bad", BAD)
 def test_an_action_that_is_not_finite_ends_the_episode_of_its_scene(bad):
-    scenes = collate(
-        [scene(straight_road(3, steps=11), [0, 1]), scene(straight_road(3, steps=11, seed=1), [0, 1])]
-    )
+    scenes = collate([scene(straight_road(3, steps=11, seed=seed), [0, 1]) for seed in (0, 1)])
     env = DrivingEnv(scenes, Displacement(), ObservationConfig.nothing())
     action = torch.zeros(2, 2, 2)
     action[..., 0] = 1.0

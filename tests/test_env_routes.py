@@ -13,15 +13,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from helpers_segments import CAR, crossing, make_road, straight_road
-from symphony import keys
+from symphony import DrivingEnv, ObservationConfig, keys
 from symphony.data.segment import RunSegment
-from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig, collate, scene
+from symphony.envs import CHOICE_FEATURES, ROUTE_FEATURES, Bicycle, Displacement, collate, scene
 from symphony.envs.objects import Objects, entering
 from symphony.envs.routes import (
     AHEAD,
-    CHOICE_FEATURES,
     POINTS,
-    ROUTE_FEATURES,
     SPACING,
     TURN_FEATURES,
     FollowedRoutes,

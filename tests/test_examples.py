@@ -47,13 +47,6 @@ def test_examples_fit_on_a_page_and_all_are_tested() -> None:
         assert f'("{name}")' in here, name
 
 
-def test_ppo_driving(example: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    metres = example("ppo_driving").main(batches=2, rows=4, steps=12, hidden=8)
-    assert len(metres) == 2
-    assert all(0 < driven < 4 * 12 * 10 for driven in metres)
-    assert "m per crash" in capsys.readouterr().out
-
-
 def without_cars() -> None:
     """Run the examples of what has nothing to do with them, and tell which modules of the package they load."""
 

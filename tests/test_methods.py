@@ -26,7 +26,7 @@ from symphony.config import AgentSpec, SearchConfig, TrainConfig, read_json, to_
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, Displacement, DrivingEnv, ObservationConfig
 from symphony.errors import ConfigError
-from symphony.learning import SearchReplay
+from symphony.learning import SearchReplay, transitions
 from symphony.learning.demonstrations import SceneDataset
 from symphony.learning.experts import logged
 from symphony.recipes import train
@@ -316,20 +316,32 @@ def test_goal_batches_are_the_choices_of_the_environment(dataset: SceneDataset) 
             assert (label[same] == env.scenes.route_logged[0, agent]).all()
 
 
-def test_fitted_states_are_those_of_the_experts(dataset: SceneDataset) -> None:
-    items = [2, 0, 1]
-    scenes = dataset.scenes(items)
-    state, valid, progress = dataset.fitted(items, scenes)
-    log, log_valid = logged(scenes)
-    assert torch.equal(valid, log_valid)
-    assert (state - log)[..., :2].norm(dim=-1)[valid].max() < 0.5
-    assert not torch.equal(state, log)
+@pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
+def test_fitted_states_are_those_of_the_experts_and_transitions_lead_through_them(store, dynamics):
+    data, items = SceneDataset(SegmentStore(store), 2, dynamics, routes=True), [2, 0, 1]
+    sees = ObservationConfig(num_objects=3, num_points=4, route=True)
+    env, fit = DrivingEnv(data.scenes(items), dynamics, sees), data.fitted(items, data.scenes(items))
+    found = transitions(data, items, sees, reward=lambda before, after: after[keys.STATE][..., 3])
+    log, log_valid = logged(env.scenes)
+    assert torch.equal(fit.valid, log_valid)
+    assert (fit.state - log)[..., :2].norm(dim=-1)[log_valid].max() < 0.5
+    assert found["next", "truncated"].sum() == len(items)
+    assert DrivingEnv(data, dynamics, sees).action_spec == env.action_spec
     for b, item in enumerate(items):
-        found = dataset.experts(item)
-        steps, rows = found.states.shape[1], found.agent.tolist()
-        for n, agent in enumerate(scenes.interactive[b].tolist()):
-            assert torch.equal(state[b, :steps, n], found.states[rows.index(agent)])
-            assert torch.equal(progress[b, :steps, n], found.progress[rows.index(agent)])
+        experts = data.experts(item)
+        steps, rows = experts.states.shape[1], experts.agent.tolist()
+        for n, agent in enumerate(env.scenes.interactive[b].tolist()):
+            assert torch.equal(fit.state[b, :steps, n], experts.states[rows.index(agent)])
+            assert torch.equal(fit.progress[b, :steps, n], experts.progress[rows.index(agent)])
+        now = env.with_goals(env.start(torch.tensor([b])))
+        for step in found[found["scene"].squeeze(-1) == b]:
+            known, after = step[keys.VALID], step["next"]
+            now = env.step(now.set(keys.ACTION, step[keys.ACTION][None]))["next"]
+            assert {*now.keys(True, True)} == {*after.keys(True, True)}
+            torch.testing.assert_close(now[keys.STATE][0][known], after[keys.STATE][known])
+            fitted = fit.state[b, int(after[keys.STEP])]
+            torch.testing.assert_close(after[keys.STATE][known], fitted[known], atol=1e-3, rtol=0)
+            torch.testing.assert_close(after[keys.REWARD][known][:, 0], after[keys.STATE][known][:, 3])
 
 
 def test_one_search_serves_as_many_updates_as_configured(store, tmp_path, monkeypatch):

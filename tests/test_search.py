@@ -13,13 +13,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from helpers_agents import make_agent
 from helpers_segments import crossing, make_road, make_segment, straight_road
 from helpers_store import fill
 from symphony import keys, load_agent
-from symphony.collectors import Backtrack, KeepBest
+from symphony.collectors import Backtrack, KeepBest, with_rows
 from symphony.config import EvaluateConfig, SearchConfig
 from symphony.envs import Bicycle, DrivingEnv, ObservationConfig, scene
 from symphony.errors import ConfigError
@@ -28,7 +29,7 @@ from symphony.evaluation.records import evaluation_record, simulation_way
 from symphony.learning.demonstrations import SceneDataset
 from symphony.modules import SeededNoise
 from symphony.roadgraph import LaneGraph
-from symphony.rollouts import simulate
+from symphony.rollouts import RouteGoals, simulate
 from symphony.rollouts.crowd import crowd_dataset
 from symphony.rollouts.driving import filled_lines, simulation
 from symphony.rollouts.search import rule_score, search
@@ -182,6 +183,39 @@ def test_neither_discriminator_nor_search_touches_the_goals(scenes, agent, monke
     assert all(torch.equal(goals, drawn[0]) for goals in drawn)
     # Each of them does change what survives.
     assert all(not torch.equal(a, b) for a, b in pairwise(states))
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_route_goals_are_given_at_each_reset_and_kept_after(scenes, agent, drawn):
+    base = DrivingEnv(scenes, agent.dynamics, agent.observation, seed=1)
+    env = with_rows(TransformedEnv(base, RouteGoals(agent.goals if drawn else None, seed=7)), [12])
+    found = env.reset()
+    row, number = (found[key].squeeze(-1) for key in (keys.SCENE, keys.STREAM))
+    plain = found.clone().set(keys.GOAL, torch.full_like(found[keys.GOAL], -1))
+    goal = draw_goals(base, agent.goals, plain, 7, number) if drawn else scenes.route_logged[row]
+    assert (goal >= 0).any()
+    assert (found == base.with_goals(plain, goal)).all()
+    later = step_mdp(env.rand_step(env.rand_step(found)["next"]))
+    again = env.reset(later.set("_reset", torch.arange(12)[:, None] < 4), set_state=False)
+    assert (again[4:] == later[4:].select(*again.keys(True, True))).all()
+    assert again[keys.STEP].flatten().tolist() == [0] * 4 + [2] * 8
+    assert (again[keys.GOAL][:4] >= 0).any()
+    held = base.with_goals(base.start(row), torch.zeros_like(goal))
+    assert torch.equal(env.reset(held, set_state=True)[keys.GOAL], held[keys.GOAL])
+    assert TransformedEnv(base, RouteGoals(agent.goals)).rollout(2).shape == (2,)
+
+
+def test_agents_that_need_routes_and_have_none_say_so(dataset, scenes):
+    bare = SceneDataset(dataset.store, 2, Bicycle())
+    sees, blind = ObservationConfig(num_objects=2, num_points=0, route=True), ObservationConfig.nothing()
+    with pytest.raises(ConfigError, match=r"routes=True"):
+        DrivingEnv(bare, Bicycle(), sees)
+    for source in (bare, bare.scenes(range(2))):
+        with pytest.raises(ConfigError, match=r"routes=True"):
+            TransformedEnv(DrivingEnv(source, Bicycle(), blind), RouteGoals()).reset()
+    for source in (dataset, scenes):
+        with pytest.raises(ConfigError, match="RouteGoals"):
+            DrivingEnv(source, Bicycle(), sees).rollout(2)
 
 
 def test_goals_depend_on_seed_scene_and_tree_alone(env, agent):

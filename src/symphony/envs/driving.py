@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Categorical, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from symphony import keys
-from symphony.envs.dynamics import Bicycle, Displacement
+from symphony.envs.dynamics import BOUNDS, Bicycle, Displacement
 from symphony.envs.flags import collision_flags, offroad_flags
 from symphony.envs.objects import Objects, entering, everyone_at, rows_of
 from symphony.envs.observation import ObservationConfig, observation_spec, observe_states
@@ -27,6 +27,8 @@ from symphony.streams import fold_in
 Event = Literal["collision", "offroad"]
 EVENTS = {"collision": keys.COLLISION, "offroad": keys.OFFROAD}
 """What can end an episode."""
+NO_ROUTES = "agents observe or draw routes, but their scenes come without: SceneDataset(..., routes=True)"
+NO_GOALS = "agents observe routes and follow none: TransformedEnv(env, RouteGoals()), or start(..., goal)"
 
 
 def penalty(before: TensorDictBase, after: TensorDictBase) -> Float[Tensor, "*b N"]:
@@ -82,7 +84,7 @@ class DrivingEnv(EnvBase):
     starts from the given simulation state.
 
     Raises:
-        ConfigError: for an unknown name in ``ends_on``, or both seed and generator.
+        ConfigError: for an unknown name in ``ends_on``, both seed and generator, or routes observed and not there.
     """
 
     batch_locked = False
@@ -90,6 +92,8 @@ class DrivingEnv(EnvBase):
     _supports_set_state = True
     _scenes: SceneBatch | None = None
     open_traffic: bool = False
+    dt: float = 0.0
+    _followed: bool = False  # whether routes were ever given
 
     def __init__(
         self,
@@ -112,6 +116,8 @@ class DrivingEnv(EnvBase):
         self.source: SceneSource | None = None if isinstance(scenes, SceneBatch) else scenes
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.observation = ObservationConfig() if observation is None else observation
+        if self.observation.route and not getattr(scenes, "routes", True):
+            raise ConfigError(NO_ROUTES)
         self.reward = penalty if reward is None else reward
         self.ends_on = tuple(EVENTS[name] for name in ends_on)
         self._rng = torch.Generator() if generator is None else generator
@@ -121,6 +127,7 @@ class DrivingEnv(EnvBase):
             self.scenes = fixed
         elif self.source is not None:
             self.open_traffic = self.source.open_traffic
+            self.dt = 0.0 if self.dynamics.discrete else float(self.source.dt)
         self._make_specs()
 
     @property
@@ -141,16 +148,16 @@ class DrivingEnv(EnvBase):
 
     @scenes.setter
     def scenes(self, scenes: SceneBatch) -> None:
-        self._scenes = scenes
+        self._scenes, before = scenes, (self.open_traffic, self.dt)
         # Read here, once: a step or a search must not wait for the device to tell.
         self.dt = float(scenes.dt[0])
         """Seconds per step, that of the scenes."""
         self.decisions = int(scenes.last_step.max())
         """Actions until the last logged step of the longest scene."""
-        before, drawn_open = self.open_traffic, self.source is not None and self.source.open_traffic
+        drawn_open = self.source is not None and self.source.open_traffic
         self.open_traffic = drawn_open or scenes.open_traffic
         """Whether agents enter and leave."""
-        if self.open_traffic != before:
+        if (self.open_traffic, self.dt if isinstance(self.dynamics, Displacement) else before[1]) != before:
             self._make_specs()
 
     def _make_specs(self) -> None:
@@ -176,9 +183,11 @@ class DrivingEnv(EnvBase):
         outcome = {"collision": flags(n, 1), "offroad": flags(n, 1)}
         self.state_spec = rows("scene", "step", "stream", **state)
         self.observation_spec = rows("scene", "step", "stream", "segment", **state, **observed, **outcome)
-        action: Categorical | Unbounded = numbers(n, 2)
-        if self.dynamics.discrete:
-            action = Categorical(self.dynamics.num_actions, shape=(n,), dtype=torch.int64, device=device)
+        if isinstance(self.dynamics, Bicycle):
+            action: Any = Categorical(self.dynamics.num_actions, shape=(n,), dtype=torch.int64, device=device)
+        else:
+            bounds = self.dt * torch.tensor(BOUNDS, dtype=torch.float32)[:, None].expand(2, n, 2)
+            action = Bounded(*bounds, device=device)
         self.action_spec, self.reward_spec = rows(action=action), rows(reward=numbers(n, 1))
         self.done_spec = Composite(done=flags(1), terminated=flags(1), truncated=flags(1))
 
@@ -247,8 +256,8 @@ class DrivingEnv(EnvBase):
         (moved,), routes = _flat(row.ndim, state.get(keys.STATE)), self.scenes.routes.among(row.flatten())
         scale, turns = self.observation.distance_scale, self.observation.turns
         features, mask = route_choices(moved, routes, scale, turns=turns)
-        state.set(keys.ROUTES, features.unflatten(0, row.shape))
-        return state.set(keys.ROUTES_MASK, mask.unflatten(0, row.shape))
+        state.set(keys.ROUTES, features.reshape(*row.shape, *features.shape[1:]))
+        return state.set(keys.ROUTES_MASK, mask.reshape(*row.shape, *mask.shape[1:]))
 
     def with_goals(self, state: TensorDictBase, goal: Int[Tensor, "*b N"] | None = None) -> TensorDict:
         """A start state whose agents follow the given routes (by default those nearest to the log)."""
@@ -257,6 +266,7 @@ class DrivingEnv(EnvBase):
         return self._from_state(self._following(start, goal))
 
     def _following(self, start: State, goal: Int[Tensor, "*b N"]) -> State:
+        self._followed = True
         start = start._replace(goal=goal, progress=torch.zeros_like(start.progress))
         return start._replace(progress=self._progress(start, start.state))
 
@@ -291,6 +301,8 @@ class DrivingEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         now = self._read(tensordict)
+        if self.observation.route and not self._followed and on_host(now.goal) and bool((now.goal < 0).all()):
+            raise ConfigError(NO_GOALS)
         index = _of(self.scenes.interactive, now.scene)
         size = self.scenes.box_size[now.scene[..., None], index]
         after = self._moved(tensordict, now.state, size)

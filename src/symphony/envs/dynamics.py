@@ -26,6 +26,8 @@ WHEELBASE = 0.6
 """Wheelbase as a fraction of the box length; the axles lie symmetrically about the centre."""
 STEEPEST = 0.3
 """Largest ratio of sideways to distance that a displacement is made up with."""
+BOUNDS = (-10.0, -15.0), (50.0, 15.0)
+"""m/s forward and to the left between which the action spec has displacements; a step takes any."""
 
 States = Float[Tensor, "*#b 4"]
 Sizes = Float[Tensor, "*b 2"]

@@ -90,9 +90,8 @@ def road_distance(
         wrong = torch.ones_like(flat, dtype=torch.bool)
     else:
         nearest, inside = _nearest(tables, scene, position)
-        flat = distance_to(position.reshape(1, -1, 2), **tables.edges, nearest=nearest[None]).view(
-            position.shape[:2]
-        )
+        flat = distance_to(position.reshape(1, -1, 2), **tables.edges, nearest=nearest[None])
+        flat = flat.view(position.shape[:2])
         wrong = ~inside.view(flat.shape)
         if not inside.all():
             # Outside of the cells, or of a map that has none: rows that hold such a position, among all edges.

@@ -71,8 +71,7 @@ class ObservationConfig:
     @property
     def blind(self) -> bool:
         """Whether nothing is asked for, a route aside."""
-        counts = self.num_objects, self.num_points, self.num_lights
-        return not (any(counts) or self.own or self.clearance)
+        return not (self.num_objects or self.num_points or self.num_lights or self.own or self.clearance)
 
     @classmethod
     def nothing(cls) -> ObservationConfig:
@@ -150,9 +149,8 @@ def observe(
         state = torch.cat([who.state[..., :3], who.speed[..., None]], -1)
         seen["route"] = route_ahead(state, routes, config.distance_scale)
     if config.clearance:
-        origin = who.origin
-        corners = box_corners(origin, who.heading, who.size)
-        queried = torch.cat([origin[..., None, :], corners], -2)
+        corners = box_corners(who.origin, who.heading, who.size)
+        queried = torch.cat([who.origin[..., None, :], corners], -2)
         of_each = None if who.height is None else who.height.repeat_interleave(queried.shape[2], 1)
         road = road_distance(scenes, scene, queried.flatten(1, 2), tables, of_each)
         seen["road"] = road.unflatten(1, queried.shape[1:3])

@@ -59,14 +59,10 @@ class RouteTable:
 
     points: NDArray[
         np.float32
-    ]  # [P, 2] of all routes, one after the other, SPACING apart from beside the vehicle on
+    ]  # [P, 2] of all, one after the other, SPACING apart from beside the vehicle on
     count: NDArray[np.int64]  # [G] points of each
-    right: NDArray[
-        np.bool_
-    ]  # [G] those nearest to the logged trajectory; several where they part beyond its end
-    logged: (
-        int  # one of these, drawn uniformly from segment and agent alone; -1 where the vehicle is on no lane
-    )
+    right: NDArray[np.bool_]  # [G] those nearest to the log; several where they part beyond its end
+    logged: int  # one of these, drawn from segment and agent alone; -1 where the vehicle is on no lane
 
     def line(self, route: int) -> NDArray[np.float32]:
         """Points [K, 2] of one route."""

@@ -120,6 +120,11 @@ class SceneSource(Protocol):
     """N, interactive agents per scene."""
 
     @property
+    def dt(self) -> float:
+        """Seconds per step of all its scenes; displacements are bounded by it."""
+        ...
+
+    @property
     def open_traffic(self) -> bool:
         """Whether its scenes say where their maps end."""
         ...
@@ -295,15 +300,8 @@ def collate(scenes: Sequence[SceneBatch], agents: int = 0) -> SceneBatch:
 
 
 _INDEX_FIELDS = ("point_light", "edge_previous", "edge_following")
-_AGENT_FIELDS = [
-    "interactive",
-    "interactive_valid",
-    "enter",
-    "background",
-    "route_first",
-    "route_count",
-    "route_logged",
-]
+_AGENT_FIELDS = ["interactive", "interactive_valid", "enter", "background"]
+_AGENT_FIELDS += ["route_first", "route_count", "route_logged"]
 
 
 def _edges(boundary: Polylines, levels: Levels) -> dict[str, NDArray[Any]]:

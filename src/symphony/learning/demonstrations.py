@@ -8,11 +8,11 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from operator import attrgetter
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -317,27 +317,73 @@ class SceneDataset:
         batch.set(keys.GOAL_SET, torch.from_numpy(right)[:, None].to(device) & mask)
         return batch
 
-    def fitted(self, items: Sequence[int], scenes: SceneBatch) -> tuple[Tensor, Tensor, Tensor]:
-        """The motion of the interactive agents of some segments, as the fit to the action space has it.
-
-        Args:
-            items: the segments.
-            scenes: their scenes.
-
-        Returns:
-            States [B, T, N, 4], where the log is valid [B, T, N], and metres along the routes that were taken
-            [B, T, N], 0 without routes; agents that are no experts as logged.
-        """
+    def fitted(self, items: Sequence[int], scenes: SceneBatch) -> Fitted:
+        """The motion of the interactive agents of some segments, as the fit to the action space has it."""
         state, valid = logged(scenes)
-        state, valid, progress = state.clone(), valid.clone(), torch.zeros_like(state[..., 0])
+        state, progress, known = (
+            state.clone(),
+            torch.zeros_like(state[..., 0]),
+            torch.zeros_like(valid[:, 1:]),
+        )
+        action = torch.zeros_like(state[:, 1:, ..., :2])
+        action = action[..., 0].long() if self.dynamics.discrete else action
         for b, expert in enumerate(self.experts.many(items)):
             steps = expert.states.shape[1]
             hit = expert.agent[:, None].to(scenes.device) == scenes.interactive[b]
             which, place = hit.nonzero(as_tuple=True)
             state[b, :steps, place] = expert.states.to(scenes.device)[which].transpose(0, 1)
+            done = expert.actions.to(action)[which].transpose(0, 1)
+            action[b, : steps - 1, place] = done
+            known[b, : steps - 1, place] = expert.valid.to(scenes.device)[which].T
             if self.routes:
                 progress[b, :steps, place] = expert.progress.to(scenes.device)[which].T
-        return state, valid, progress
+        return Fitted(state, valid, progress, action, known & scenes.interactive_valid[:, None])
+
+
+class Fitted(NamedTuple):
+    """The motion of interactive agents; those that are no experts as logged, without actions."""
+
+    state: Float[Tensor, "B T N 4"]
+    valid: Bool[Tensor, "B T N"]  # where the log is
+    progress: Float[Tensor, "B T N"]  # metres along the routes that were taken, 0 without routes
+    action: Shaped[Tensor, "B Tm1 N ..."]
+    known: Bool[Tensor, "B Tm1 N"]  # where the log is valid before and after an action
+
+
+def transitions(
+    data: SceneDataset,
+    items: Sequence[int] | None = None,
+    observation: ObservationConfig | None = None,
+    **how: Any,
+) -> TensorDict:
+    """What the interactive agents of logged segments did, as the steps of a :class:`DrivingEnv`: for replay buffers.
+
+    Args:
+        data: the segments; agents follow the routes that they took, where it has routes.
+        items: some of them; all by default.
+        observation: what the agents observe.
+        how: ``reward`` and ``ends_on`` of the environment.
+
+    Returns:
+        TensorDict [M] of steps (s, a, r, s') with all entries of the environment's, the state after a step under
+        ``"next"``, segment by segment in the order of time. ``VALID`` are agents whose action the log shows; steps
+        without any are left out. The last step of a segment is ``truncated``.
+    """
+    from symphony.envs.driving import DrivingEnv  # noqa: PLC0415 - cloning needs no environment
+
+    items = range(len(data)) if items is None else items
+    scenes = data.scenes(items)
+    env, fit = DrivingEnv(scenes, data.dynamics, observation, **how), data.fitted(items, scenes)
+    row = torch.arange(len(scenes))[:, None].expand(fit.known.shape[:2])
+    step = torch.arange(row.shape[1]).expand(row.shape)
+    route = scenes.route_logged if data.routes else torch.full_like(scenes.interactive, -1)
+    rows = {keys.SCENE: row, keys.STEP: step, keys.STREAM: scenes.stream[row]}
+    each = {keys.GOAL: route[row], keys.STATE: fit.state[:, :-1], keys.VALID: fit.valid[:, :-1]}
+    each |= {key: value[..., None] for key, value in rows.items()} | {keys.PROGRESS: fit.progress[:, :-1]}
+    found = env.step(env.at(TensorDict(each, batch_size=row.shape)).set(keys.ACTION, fit.action))
+    for part in (found, found.get("next")):
+        part.set(keys.VALID, fit.known)
+    return found[fit.known.any(-1)]
 
 
 def _seen_routes(

@@ -27,13 +27,7 @@ from symphony.data.selection import MOVING, travel
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.objects import objects_at
 from symphony.envs.observation import ObservationConfig, observe
-from symphony.envs.routes import (
-    FollowedRoutes,
-    RouteTable,
-    RouteWindow,
-    logged_progress,
-    route_table,
-)
+from symphony.envs.routes import FollowedRoutes, RouteTable, RouteWindow, logged_progress, route_table
 from symphony.envs.scene import SceneBatch
 from symphony.errors import DataError
 from symphony.files import replacing

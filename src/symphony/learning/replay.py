@@ -66,12 +66,7 @@ class SearchReplay:
             raise RuntimeError("nothing was searched yet")
         return self._leaves
 
-    def survivors(
-        self,
-        count: int,
-        rng: torch.Generator,
-        observation: ObservationConfig,
-    ) -> TensorDict:
+    def survivors(self, count: int, rng: torch.Generator, observation: ObservationConfig) -> TensorDict:
         """States of surviving rollouts and what was done in them, drawn uniformly from all before the scenes' ends.
 
         Args:
@@ -120,7 +115,7 @@ class SearchReplay:
 
     def _logged(self, count: int, rng: torch.Generator) -> TensorDict:
         scenes = self.env.scenes
-        state, logged, progress = self.data.fitted(scenes.segment.tolist(), scenes)
+        state, logged, progress, *_ = self.data.fitted(scenes.segment.tolist(), scenes)
         rows = logged[:, 1:].any(-1).nonzero()
         scene, step = rows[torch.randint(len(rows), (count,), generator=rng).to(rows.device)].unbind(-1)
         step = step + 1
@@ -177,12 +172,7 @@ def _after(steps: TensorDictBase) -> TensorDictBase:
     return kept.update(TensorDict(after, batch_size=kept.batch_size))
 
 
-def _drawn(
-    env: DrivingEnv,
-    steps: TensorDictBase,
-    count: int,
-    rng: torch.Generator,
-) -> TensorDictBase:
+def _drawn(env: DrivingEnv, steps: TensorDictBase, count: int, rng: torch.Generator) -> TensorDictBase:
     """Some [K] of the steps [*b] before their scenes' last, uniformly with replacement."""
     counted = (steps.get(keys.STEP) < env.scenes.last_step[steps.get(keys.SCENE)]).squeeze(-1)
     rows = counted.nonzero()

@@ -28,19 +28,9 @@ def squash(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
     return x / (1.0 + x.square()).sqrt()
 
 
-def unsquash(y: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Inverse of :func:`squash`."""
-    return y / (1.0 - y.square()).sqrt()
-
-
 def positive(x: Float[Tensor, "*b"], smooth: float = SMOOTH) -> Float[Tensor, "*b"]:
     """A smooth `max(x, 0)`: `(x + sqrt(x^2 + smooth^2)) / 2`, above it by at most `smooth / 2`."""
     return 0.5 * (x + (x.square() + smooth**2).sqrt())
-
-
-def positive_inverse(y: Float[Tensor, "*b"], smooth: float = SMOOTH) -> Float[Tensor, "*b"]:
-    """Inverse of :func:`positive`, for `y > 0`."""
-    return y - smooth**2 / (4.0 * y)
 
 
 def displaced(
@@ -66,7 +56,7 @@ def shares(
     as so many.
     """
     forward = displacement[..., 0].clamp_min(least)
-    first = (positive_inverse(forward) - pace) / reach
+    first = (forward - SMOOTH**2 / (4.0 * forward) - pace) / reach
     return torch.stack([first, displacement[..., 1] / (forward * slope)], -1)
 
 
@@ -130,7 +120,8 @@ class BoundedDisplacement(Distribution):
     def latent(self, displacement: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
         """Inverse of :meth:`displacement`; what lies outside the bounds or next to them is moved to INSIDE them."""
         share = shares(displacement, self.pace, self.slope, self.reach)
-        return unsquash(share.clamp(-INSIDE, INSIDE))
+        share = share.clamp(-INSIDE, INSIDE)
+        return share / (1.0 - share.square()).sqrt()
 
     def rsample(
         self,
@@ -156,7 +147,7 @@ class BoundedDisplacement(Distribution):
         return self.mode
 
     def log_prob(self, value: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
-        """Log-density [...]; that of the nearest displacement INSIDE the bounds where `value` is not."""
+        """Log-density [...]; that of the nearest displacement INSIDE the bounds where `value` is not: no entropy."""
         u = self.latent(value)
         # Both squashings have the derivative (1 + u^2)^(-3/2).
         volume = log_area(squash(u), self.pace, self.slope, self.reach)

@@ -19,11 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from symphony.objectives.base import MaskedLoss, Reduction
 
 Cost = Literal["log_d", "non_saturating", "logit"]
-COSTS = {
-    "log_d": functional.logsigmoid,
-    "non_saturating": functional.softplus,
-    "logit": lambda score: score,
-}
+COSTS = {"log_d": functional.logsigmoid, "non_saturating": functional.softplus, "logit": lambda score: score}
 """Of a state with logit x, D = sigmoid(x) the probability that it is simulated: log D (the paper), whose gradient
 vanishes where D is sure of the log; -log(1 - D), whose gradient vanishes where D is fooled; x, whose never does.
 """
@@ -168,11 +164,7 @@ class MGAILLoss(MaskedLoss):
         return result
 
     def _simulate(
-        self,
-        env: EnvBase,
-        now: TensorDictBase,
-        numbers: Float[Tensor, "*_"] | None,
-        steps: int,
+        self, env: EnvBase, now: TensorDictBase, numbers: Float[Tensor, "*_"] | None, steps: int
     ) -> tuple[Float[Tensor, "*b T N"], Bool[Tensor, "*b T N"]]:
         """Logits and whether the episode still ran, `[..., steps, N]`."""
         batch, scores, going = now.batch_dims, [], []

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from symphony.imports import lazily
 
 if TYPE_CHECKING:
-    from symphony.rollouts.unroll import Rollouts, simulate
+    from symphony.rollouts.unroll import Rollouts, RouteGoals, simulate
 
-__all__ = ["Rollouts", "simulate"]
+__all__ = ["Rollouts", "RouteGoals", "simulate"]
 
 __getattr__, __dir__ = lazily(__name__)

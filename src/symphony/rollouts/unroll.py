@@ -11,13 +11,14 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn.functional import pad
+from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from symphony import keys
-from symphony.envs.driving import DrivingEnv
+from symphony.envs.driving import NO_ROUTES, DrivingEnv
 from symphony.envs.objects import rollout_heights
 from symphony.envs.scene import SceneBatch
-from symphony.errors import SymphonyError
+from symphony.errors import ConfigError, SymphonyError
 from symphony.geometry.nearest import on_host
 from symphony.metrics import collisions
 from symphony.modules import drawn_goals
@@ -93,6 +94,35 @@ def draw_goals(
     return torch.where(waiting, drawn(everyone), found)
 
 
+class RouteGoals(Transform):
+    """Gives agents the routes that they follow at every reset of a :class:`DrivingEnv`: the first of its transforms.
+
+    Agents that follow one already, as in a state that was reset to, keep it.
+
+    Args:
+        goals: a goal policy, such as an agent's ``goals``, or another module that reads ``ROUTES`` and
+            ``ROUTES_MASK`` and writes ``GOAL``; by default agents follow the routes nearest to the log.
+        seed: of what is drawn, beside the rollout's identity.
+
+    Raises:
+        ConfigError: on reset, if the scenes come without routes.
+    """
+
+    def __init__(self, goals: TensorDictModuleBase | None = None, *, seed: int = 0) -> None:
+        super().__init__()
+        self.goals, self.seed = goals, seed
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        env, found = self.parent, tensordict_reset
+        if not getattr(env.source, "routes", env.scenes.route_first.shape[-1]):
+            raise ConfigError(NO_ROUTES)
+        tree = found.get(keys.STREAM).squeeze(-1)
+        goal = None if self.goals is None else draw_goals(env, self.goals, found, self.seed, tree)
+        given = env.with_goals(found, goal)
+        new = (found.get(keys.STEP).squeeze(-1) == 0) & (found.get(keys.GOAL) < 0).all(-1)
+        return found.update(torch.where(new, given, found.select(*given.keys(True, True))))
+
+
 def _drawn(
     env: DrivingEnv, scene: Int[Tensor, "*b 1"], seed: int, use: Stream, number: Int[Tensor, "*b"]
 ) -> Float[Tensor, "*b N"]:
@@ -114,12 +144,11 @@ def start_states(
 ) -> TensorDictBase:
     """First states [B, trees, branches] of all scenes, observed once they have their goals.
 
-    Goals are drawn by the goal policy, if there is one, or those nearest to the log: once for all branches of a tree
-    (paper, section IV-B), or for each branch alone. ``fix`` gives the goals that agents follow, from rows of the
-    scenes [*b] and these goals [*b, N].
+    Goals are drawn by the goal policy, if there is one, or nearest to the log: once for a tree (paper, section IV-B),
+    or for each branch. ``fix`` gives those that agents follow, from rows [*b] of the scenes and these goals [*b, N].
     """
     device, shape = env.scenes.device, (len(env.scenes), trees, branches)
-    scene = torch.arange(len(env.scenes), device=device)[:, None, None].expand(shape)
+    scene = torch.arange(shape[0], device=device)[:, None, None].expand(shape)
     number = torch.arange(trees * branches, device=device).reshape(trees, branches).expand(shape)
     goal = torch.full((*shape, env.num_agents), -1, device=device)
     if goals is not None and logged_goals:
@@ -206,10 +235,8 @@ class NotFiniteError(SymphonyError):
 
 class NaNGuard(TensorDictModuleBase):
     """A module that remembers in which scenes, and when first, a guarded entry [*b, N, ...] that it put out was not
-    finite for a valid agent; looked at once, at the end, so that no step waits for the device.
-
-    One that scores sees the last state of a scene, too, others act in those before. Past a scene's end there is only
-    the padding of its batch.
+    finite for a valid agent; looked at once, at the end, so that no step waits for the device. One that scores sees
+    the last state of a scene, too; past a scene's end there is only padding.
     """
 
     def __init__(

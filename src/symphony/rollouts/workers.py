@@ -30,9 +30,8 @@ Work = Callable[[T], R]
 
 
 def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) -> int:
-    """Run segments to simulate at a time: as many as the configuration says. Where it leaves that open, up to
-    ``TOGETHER``, as a step of few agents costs little less than one of many; fewer if they see more than ``POINTS``,
-    each with so many interactive agents where not everyone is driven.
+    """Run segments to simulate at a time: as many as the configuration says, by default up to ``TOGETHER``, as a step
+    of few agents costs little less than one of many; fewer if they see more than ``POINTS``.
     """
     if config.batch:
         return config.batch
@@ -44,9 +43,7 @@ def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) ->
 
 
 def batches(items: Sequence[int], size: int, config: EvaluateConfig) -> list[list[int]]:
-    """Items in their order, so many at a time; where the configuration leaves that open, so few that each of several
-    workers gets two batches.
-    """
+    """Items in their order, so many at a time, by default so few that each of several workers gets two batches."""
     if config.workers > 1 and not config.batch:
         size = max(1, min(size, -(-len(items) // (2 * config.workers))))
     return [list(items[first : first + size]) for first in range(0, len(items), size)]
