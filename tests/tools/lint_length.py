@@ -53,10 +53,14 @@ def words(root: Path) -> int:
 
 
 def size(root: Path, room: str) -> int:
-    """The lines of a room, of the files beside the rooms (`leaves`) or of `tests`; the words of `docs`."""
+    """The lines of a room, of all rooms (`symphony`), of the files beside them (`leaves`) or of `tests`; the words of
+    `docs`.
+    """
     package = root / "src" / "symphony"
     if room == "docs":
         return words(root)
+    if room == "symphony":
+        return sum(lines for _, lines in python(package))
     if room == "leaves":
         return sum(lines for file, lines in python(package) if file.parent == package)
     return sum(lines for _, lines in python(root / "tests" if room == "tests" else package / room))

@@ -69,9 +69,8 @@ def contacts(worlds: Sequence[World], evaluated: Indices) -> list[Contacts]:
     subject = from_numpy(evaluated).expand(len(worlds), -1)
     found = meetings(position, heading, size, valid, subject, height)
     parts = evaluated[found.subject.numpy()], found.other.numpy(), found.step.numpy() + 1, found.share.numpy()
-    return [
-        _first(world, *(part[found.row.numpy() == k] for part in parts)) for k, world in enumerate(worlds)
-    ]
+    of = [found.row.numpy() == k for k in range(len(worlds))]
+    return [_first(world, *(part[mine] for part in parts)) for world, mine in zip(worlds, of, strict=True)]
 
 
 def _first(world: World, agent: Indices, other: Indices, step: Indices, share: Reals) -> Contacts:

@@ -111,9 +111,8 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
     along_lane = shapely.line_locate_point(lines, shapely.points(stop))
     piece = np.minimum(1.0, length)
     begin = np.minimum(along_lane, length - piece)
-    ends = [
-        shapely.get_coordinates(shapely.line_interpolate_point(lines, at)) for at in (begin, begin + piece)
-    ]
+    places = [shapely.line_interpolate_point(lines, at) for at in (begin, begin + piece)]
+    ends = [shapely.get_coordinates(place) for place in places]
     direction = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0], axis=-1, keepdims=True)
     heading = world.heading[evaluated]
     forward = np.stack([np.cos(heading), np.sin(heading)], -1)

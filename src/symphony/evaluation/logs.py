@@ -130,6 +130,5 @@ def shortfalls(quality: dict[str, Any]) -> list[str]:
     rates = {name: quality[name] for name in ("collision_rate", "offroad_time")}
     over = [f"{n} {rate:.2f} % is over {MOST_FAULTS} %" for n, rate in rates.items() if rate > MOST_FAULTS]
     few = {name: share for name, share in quality["directions"].items() if share < LEAST_DIRECTION}
-    return over + [
-        f"only {n:.1f} % of the choices are {k}, below {LEAST_DIRECTION:.0f} %" for k, n in few.items()
-    ]
+    end = f"below {LEAST_DIRECTION:.0f} %"
+    return over + [f"only {n:.1f} % of the choices are {k}, {end}" for k, n in few.items()]

@@ -107,10 +107,11 @@ def planners_text(records: Sequence[Record]) -> str:
             for name, (_, digits) in COLUMNS.items():
                 value, error, bound = one[name], one.get(f"{name}_se"), one.get(f"{name}_bound")
                 text = "–" if value is None else f"{value:.{digits}f}"
-                text += (
-                    "" if value is None or error is None or bound is not None else f" ± {error:.{digits}f}"
-                )
-                grid[-1].append(text + ("" if bound is None else f" (≤ {bound:.{digits}f})"))
+                if bound is not None:
+                    text += f" (≤ {bound:.{digits}f})"
+                elif value is not None and error is not None:
+                    text += f" ± {error:.{digits}f}"
+                grid[-1].append(text)
     return "\n".join([markdown(grid), *winners(records)]).rstrip() + "\n"
 
 

@@ -103,9 +103,8 @@ def report(
     is called with the segments done and their total.
     """
     if not picked and "hunt" in folder.about.settings:
-        raise DataError(
-            "`symphony hunt` picked runs that fail: see them, but count nothing", file=folder.path
-        )
+        why = "`symphony hunt` picked runs that fail: see them, but count nothing"
+        raise DataError(why, file=folder.path)
     found = Report(folder.about.agent, evaluated)
     for number, saved in enumerate(folder):
         add_segment(found, saved)
@@ -227,12 +226,9 @@ def total_numbers(rows: Sequence[Row]) -> Row:
     out: Row = {"runs": len(rows), "failed_runs": len(rows) - len(good)}
     out |= {"segments": len({row["segment"] for row in rows}), "groups": len(names)}
     for name, (of, scale, by) in _MEANS.items():
-        value = np.array(
-            [bool(row[of]) if of == "red_lights" else row[of] or 0.0 for row in good], np.float64
-        )
-        weight = np.array(
-            [(1.0 if by is None else row[by]) * (row[of] is not None) for row in good], np.float64
-        )
+        seen = [bool(row[of]) if of == "red_lights" else row[of] or 0.0 for row in good]
+        counts = [(1.0 if by is None else row[by]) * (row[of] is not None) for row in good]
+        value, weight = np.array(seen, np.float64), np.array(counts, np.float64)
         out[name], out[f"{name}_se"] = grouped_mean(scale * value, weight, member)
         has = weight > 0
         out[f"{name}_segments"] = len({row["segment"] for row, some in zip(good, has, strict=True) if some})

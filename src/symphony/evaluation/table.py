@@ -25,18 +25,8 @@ METRICS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
 """The paper's; collisions are those at states only, as the paper counts them."""
 _TRAFFIC = ("interactive", "others", "open_traffic", "radius")
 """Settings of an evaluation that decide what agents meet: rows of a table share them."""
-_FREE = (
-    "seed",
-    "data",
-    "validation.data",
-    "out",
-    "warm_start",
-    "resume",
-    "device",
-    "wandb",
-    "checkpoint_every",
-    "log_every",
-)
+_PLACES = ("data", "validation.data", "out", "warm_start", "device", "wandb")
+_FREE = ("seed", "resume", "checkpoint_every", "log_every", *_PLACES)
 """What may differ between runs of one method: which seed, where things lie."""
 
 
@@ -121,9 +111,7 @@ def collect(
             reason = f"trained with {acting} interactive agents for {lasting or WHOLE_LOG:g} s"
         else:
             wanted = {(interactive, duration) for duration in (0, lasting or WHOLE_LOG)}
-            how = {
-                name: (one["config"]["interactive"], one["config"]["duration"]) for name, one in kept.items()
-            }
+            how = {n: (one["config"]["interactive"], one["config"]["duration"]) for n, one in kept.items()}
             kept = {n: one for n, one in kept.items() if how[n] in wanted and setting_seconds(one) == seconds}
             names = records.fitting(kept, patterns)
             reason = "only evaluated in other ways" if kept else "not evaluated by symphony evaluate"

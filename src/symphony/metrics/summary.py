@@ -158,10 +158,7 @@ class RolloutMetrics:
             }
             error = np.array([math.fsum(rollout) for rollout in away[b]])
             count = both.sum((1, 2)).astype(np.float64)
-            sums = {
-                "ade": (error.mean(), count.mean()),
-                "min_sade": _nearest(error, count),
-            }
+            sums = {"ade": (error.mean(), count.mean()), "min_sade": _nearest(error, count)}
             for beside, driven in (("", own), ("_log", log)):
                 slow = np.abs(driven) < STANDING
                 sums[f"agent_speed{beside}"] = driven[both].sum(dtype=np.float64), compared

@@ -77,10 +77,7 @@ class EgoPlanners(NamedTuple):
 
 
 def ego_planners(
-    planners: Planners,
-    segments: Sequence[RunSegment],
-    interactive: Int[Tensor, "B N"],
-    seconds: float,
+    planners: Planners, segments: Sequence[RunSegment], interactive: Int[Tensor, "B N"], seconds: float
 ) -> list[EgoPlanners]:
     """How the first interactive agents of scenes are planned, given the rows of all of them in their segments.
 

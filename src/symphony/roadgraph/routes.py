@@ -375,9 +375,7 @@ def _returns(lines: Float[NDArray[np.float64], "R P 2"], spacing: float) -> Bool
 
 
 def ground_truth_routes(
-    lines: Sequence[Reals],
-    trajectory: Float[NDArray[Any], "T 2"],
-    valid: Bool[NDArray[np.bool_], " T"],
+    lines: Sequence[Reals], trajectory: Float[NDArray[Any], "T 2"], valid: Bool[NDArray[np.bool_], " T"]
 ) -> Bool[NDArray[np.bool_], " G"]:
     """The feasible routes with the smallest displacement error to the logged trajectory (paper, section IV-B).
 
