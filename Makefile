@@ -17,7 +17,7 @@ EXTRAS := dev,docs,argoverse2,ray,sumo,gym,video
 SPELLED := src tests recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md SECURITY.md
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo table test test-lowest fuzz kills flat mutate coverage audit bench lint format docs clean
+.PHONY: help setup demo picture table test test-lowest fuzz kills flat mutate coverage audit bench lint format docs clean
 
 help:  ## what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-12s %s\n", $$1, $$2}'
@@ -26,6 +26,13 @@ setup: $(DEV)  ## create .venv with everything for development
 
 demo: $(CORE)  ## an included agent, then one learned from the built-in data: pictures and numbers in out/demo
 	$(BIN)/symphony demo --out out/demo
+
+PICTURE := sumo-town-001000-f0-w11-v5 sumo-town-001000-f2-w03-v10 sumo-town-001005-f0-w05-v13
+
+picture: $(CORE)  ## the picture of the README: a planner among seven learned agents each, in docs/rollouts.gif
+	$(BIN)/symphony simulate pretrained:bc_ts_h --planner examples/planner.py:Careful --interactive 8 --rollouts 1 \
+		--data src/symphony/data/builtin/test --segments $(PICTURE) --out out/picture
+	$(BIN)/symphony view out/picture --out docs/rollouts.gif
 
 table: $(CORE)  ## train, evaluate and compare all eight methods, tiny, in out/table
 	$(BIN)/python benchmarks/make_table.py --out out/table

@@ -121,6 +121,27 @@ def test_planners_are_forked_with_their_branches(settings: dict[str, Any]) -> No
         assert (parents != torch.arange(parents.shape[-1])).any(), "nobody was forked"
 
 
+class Foreseeing(Wanderer):
+    """Gives back 3 s of a trajectory, the first state of which it drives; at times the next state alone."""
+
+    def plan(self, traffic: Traffic) -> Any:
+        pose = super().plan(traffic)
+        later = [Pose(pose.x + k, pose.y, pose.heading, pose.speed) for k in range(30)]
+        return pose if traffic.step % 3 == 2 else later
+
+
+@pytest.mark.parametrize("settings", SEARCHES, ids=lambda given: "-".join(map(str, given.values())))
+def test_trajectories_are_those_of_the_branch_that_drove_them(settings: dict[str, Any]) -> None:
+    found = simulated(Foreseeing, **settings)
+    for meant, state in zip(found.meant, found.rollouts.state[..., 0, :2].numpy(), strict=True):
+        assert meant.shape == (*state[:, 1:].shape[:2], 20, 2)
+        said = np.isfinite(meant[:, :, 0]).all(-1)
+        assert (said == (np.arange(said.shape[1]) % 3 != 2)).all()
+        np.testing.assert_allclose(meant[:, :, 0][said], state[:, 1:][said], atol=1e-3)
+        np.testing.assert_allclose(meant[said][:, -1] - meant[said][:, 0], [[29, 0]] * said.sum(), atol=1e-3)
+    assert simulated(Wanderer, **settings).meant == (None, None)
+
+
 def test_planners_that_share_their_memory_are_taken_for_another() -> None:
     found = simulated(Shared, **TREE)
     assert any("taken for another" in why for each in found.failed for why in each.values())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import html
 import json
 import math
 import re
@@ -24,14 +25,16 @@ from helpers_segments import crossing, hide, random_segment, straight_road
 from symphony.cli import main
 from symphony.errors import DataError
 from symphony.evaluation.report import Report, add_segment
-from symphony.render.viewer import Event, packed, view_page
+from symphony.render.viewer import Event, Replay, packed, view_page
+from symphony.render.viewer.pack import packed_log
 from symphony.saved.folder import About, save_rollouts
 from symphony.saved.rollouts import SavedRollouts
 
-ABOUT = About("made", settings={"note": "</script><b>"})
+ABOUT = About("made </script><b>")
 
 
 def blocks(page: str) -> list[str]:
+    """The logs of the segments in a page."""
     return re.findall(r'<script type="text/plain" id="segment-\d+">([^<]*)</script>', page)
 
 
@@ -54,7 +57,9 @@ def pages() -> list[SavedRollouts]:
     tracks = hide(crossing(5, steps=21), 3, slice(4, 9))
     turned = tracks.replace(heading=tracks.heading + np.float32(4 * np.pi))
     saved = played(turned, [0, 2], 3, failed={2: "broke <b>off</b>"})
-    saved = dataclasses.replace(saved, trees=random_trees(saved, branches=5))
+    plan = np.random.default_rng(0).normal(0, 30, (3, saved.steps, 4, 2)).astype("f4")
+    plan[1, 3:, 2:], plan[2] = np.nan, np.nan
+    saved = dataclasses.replace(saved, trees=random_trees(saved, branches=5), plan=plan)
     lost = random_segment("odd name", seed=3, agents=4, steps=6, lights=2, marks=3)
     return [saved, played(straight_road(2, steps=16)), played(lost, [1])]
 
@@ -63,7 +68,10 @@ def pages() -> list[SavedRollouts]:
 def test_a_packed_segment_holds_its_numbers(number: int) -> None:
     saved = pages()[number]
     event = Event(0, 3, 0, "collision", "into leader", 1, True, "collision")
-    facts, arrays = unpacked(packed(saved, [event]))
+    steps = np.random.default_rng(number).uniform(0, 20, saved.counted.shape)
+    facts, arrays = unpacked(packed(Replay(saved, [event], steps)))
+    known, held = unpacked(packed_log(saved))
+    facts, arrays = facts | known, arrays | held
     segment, there = saved.segment, np.concatenate([saved.counted[:, :1], saved.counted], 1)
     expected = {
         "id": segment.segment_id, "rollouts": saved.rollouts, "steps": saved.steps, "dt": segment.dt,
@@ -72,6 +80,12 @@ def test_a_packed_segment_holds_its_numbers(number: int) -> None:
     assert facts.items() >= expected.items()
     exact = {"log.valid": segment.valid, "lights.state": segment.signal_state, "goal": saved.goal}
     exact["sim.valid"] = there.swapaxes(1, 2)
+    np.testing.assert_allclose(arrays["ttc"], np.minimum(steps, 10.2).swapaxes(1, 2), atol=0.021)
+    if saved.plan is not None:
+        shown = np.isfinite(saved.plan).all(-1)
+        exact["plan.count"] = shown.sum(-1)
+        for axis, letter in enumerate("xy"):
+            np.testing.assert_allclose(arrays[f"plan.{letter}"][shown], saved.plan[shown, axis], atol=0.006)
     near, state = {}, np.where(there[..., None], saved.state, 0).swapaxes(1, 2)
     for axis, letter in enumerate("xy"):
         near |= {f"sim.{letter}": state[..., axis], f"log.{letter}": segment.position[..., axis]}
@@ -95,7 +109,15 @@ def test_numbers_too_large_for_a_page_are_named() -> None:
     saved = played(straight_road())
     saved.state[0, 2, 0, 3] = 400.0
     with pytest.raises(DataError, match=r"segment straight-0, field sim\.s: numbers beyond"):
-        packed(saved)
+        view_page(["made"], [[Replay(saved)]])
+
+
+def test_others_of_another_log_are_not_shown_in_step() -> None:
+    one, longer = played(straight_road(2, steps=16)), played(straight_road(2, steps=21))
+    with pytest.raises(
+        DataError, match=r"segment straight-0: two was simulated on another log, or for other"
+    ):
+        view_page(["one", "two"], [[Replay(one), Replay(longer)]])
 
 
 def test_the_page_holds_all_segments_and_loads_nothing(tmp_path: Path) -> None:
@@ -106,7 +128,7 @@ def test_the_page_holds_all_segments_and_loads_nothing(tmp_path: Path) -> None:
     assert [unpacked(block)[0]["id"] for block in blocks(page)] == [s.segment.segment_id for s in found]
     about = re.search(r'<script type="application/json" id="about">(.*?)</script>', page)
     assert about is not None
-    assert json.loads(about[1])["settings"] == {"note": "</script><b>"}
+    assert json.loads(about[1])["names"] == [ABOUT.agent]
     assert "http" not in re.sub(r'id="segment-\d+">[^<]*', "", page)
     assert not re.search(r"\b(src|href)\s*=|@import|url\(|fetch\(|XMLHttpRequest|import\(", page)
     assert "/*" not in re.sub(r"/\*.*?\*/", "", page, flags=re.S)
@@ -156,12 +178,16 @@ def browse(page: Path, *options: str, place: str = "") -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
 
 
-def driven_page(tmp_path: Path, script: str, found: list[SavedRollouts]) -> dict[str, Any]:
-    """What a script, the body of an async function, put into `out` once the page was ready."""
-    report = Report("made", "interactive")
+def driven_page(tmp_path: Path, script: str, found: list[SavedRollouts], planners: int = 1) -> dict[str, Any]:
+    """What a script, the body of an async function, put into `out` once the page was ready; with several planners,
+    so many in turn are of one segment.
+    """
+    names = [f"made <i> {number}" for number in range(planners)]
+    shown = []
     for saved in found:
-        add_segment(report, saved)
-    page = view_page("made <i>", [(saved, report.events[saved.segment.segment_id]) for saved in found])
+        add_segment(report := Report("made", "interactive"), saved)
+        shown.append(report.replay(saved))
+    page = view_page(names, [shown[k : k + planners] for k in range(0, len(shown), planners)])
     test = """<script>(async () => {
       const wait = () => new Promise(done => setTimeout(done, 50));
       while (!document.body.dataset.ready) await wait();
@@ -173,7 +199,7 @@ def driven_page(tmp_path: Path, script: str, found: list[SavedRollouts]) -> dict
     file.write_text(page.replace("</body>", test % script + "</body>"), encoding="utf-8")
     dom = browse(file, "--virtual-time-budget=8000", "--dump-dom")
     (told,) = re.findall(r'data-out="([^"]*)"', dom) or pytest.fail(dom[-3000:])
-    out = json.loads(told.replace("&quot;", '"'))
+    out = json.loads(html.unescape(told))
     assert "error" not in out, out
     return out
 
@@ -297,13 +323,83 @@ def test_a_link_follows_the_ego_and_the_legend_says_what_is_what(tmp_path: Path)
 
 
 @pytest.mark.slow
+def test_planners_play_side_by_side_and_rollouts_are_chosen_by_events(tmp_path: Path) -> None:
+    hits, calm = crash(), played(straight_road(2, steps=31, num_lanes=1), [0], 2, failed={0: "lost"})
+    hits.state[1, :10, 0, 3] += 5
+    plan = np.full((2, calm.steps, 3, 2), np.nan, np.float32)
+    plan[1, 4, :2] = [(40, 1), (50, 2)]
+    calm = dataclasses.replace(calm, plan=plan)
+    other, same = (
+        played(straight_road(3, steps=11, segment_id="other", num_lanes=1), [0], 1) for _ in range(2)
+    )
+    script = """
+      const texts = (id, of) => Array.from($(id).options, o => o[of]);
+      out.names = panes.map(pane => pane.box.textContent.trim());
+      out.kinds = about.segments.map(one => one.kinds); out.filters = texts("filter", "value");
+      const seen = () => [texts("segment", "textContent"), texts("rollout", "value"), view.segment, view.rollout];
+      const filter = async kind => {
+        $("filter").value = kind; $("filter").dispatchEvent(new Event("change"));
+        await new Promise(done => setTimeout(done, 200));
+        return seen();
+      };
+      out.all = seen(); out.fault = await filter("fault"); out.failed = await filter("failed"); await filter("");
+      choose(1); seek(12); frame(0);
+      const [one, two] = panes.map(pane => pane.scene.replay);
+      out.x = [one, two].map(r => r.simulated(1, 0, 12).x);
+      out.drawn = panes.map(({ context, canvas }) => {
+        const { data } = context.getImageData(0, 0, canvas.width, canvas.height);
+        let blue = 0;
+        for (let i = 0; i < data.length; i += 4) blue += !data[i] && data[i + 1] === 0x72 && data[i + 2] === 0xb2;
+        return blue;
+      });
+      out.wide = panes.map(pane => pane.canvas.clientWidth); out.metrics = $("metrics").width > 500;
+      const there = two.simulated(1, 0, 12), at = camera.toScreen(there.x, there.y), { canvas } = panes[1];
+      const box = canvas.getBoundingClientRect(), where = { clientX: box.left + at[0], clientY: box.top + at[1] };
+      canvas.setPointerCapture = () => 0;  // of a pointer that there is
+      for (const kind of ["pointerdown", "pointerup"]) canvas.dispatchEvent(new PointerEvent(kind, where));
+      out.clicked = [panes.indexOf(shown), view.agent, $("events").textContent];
+      out.plan = [two.plan(1, 4), two.plan(1, 5), two.plan(0, 4), one.plan(1, 4)];
+      out.ttc = Array.from({ length: 12 }, (_, t) => one.collisionIn(1, 0, t)).map(x => Number.isNaN(x) ? null : x);
+      out.away = METRICS[3][1](one, 1, 0, 12); out.speed = METRICS[0][1](one, 1, 0, 12);
+      const { x, time } = metricsLayout($("metrics"), two);
+      out.back = Math.round(time(x(2, 7)));
+      await open(1); choose(0); out.legend = $("legend").parentNode.tagName;
+    """
+    out = driven_page(tmp_path, script, [hits, calm, other, same], planners=2)
+    assert out["names"] == ["made <i> 0", "made <i> 1"]
+    assert out["kinds"][0] == [[[], ["collision", "fault"]], [["failed"], []]]
+    assert out["filters"] == ["", "collision", "fault", "failed"]
+    both, first = [hits.segment.segment_id, "other"], [hits.segment.segment_id]
+    assert (out["all"], out["fault"], out["failed"]) == (
+        [both, ["0", "1"], 0, 0], [first, ["1"], 0, 1], [first, ["0"], 0, 0],
+    )  # fmt: skip
+    np.testing.assert_allclose(out["x"], [one.state[1, 12, 0, 0] for one in (hits, calm)], atol=1e-3)
+    assert min(out["drawn"]) > 20
+    assert out["wide"][0] == pytest.approx(out["wide"][1], abs=2)
+    assert out["metrics"]
+    assert (*out["clicked"][:2], out["back"], out["legend"]) == (1, 0, 7, "ASIDE")
+    assert "none in this rollout" in out["clicked"][2]
+    np.testing.assert_allclose(out["plan"][0], plan[1, 4, :2], atol=0.006)
+    assert out["plan"][1:] == [[], [], []]
+    report = Report("made", "interactive")
+    add_segment(report, hits)
+    expected = [None, *(float(x) if x < 10 else None for x in report.collision_in[both[0]][1, :11, 0])]
+    assert any(out["ttc"])
+    assert out["ttc"] == [None if x is None else pytest.approx(x, abs=0.021) for x in expected]
+    log = hits.segment.position[0, 12, :2]
+    assert out["away"] == pytest.approx(np.linalg.norm(hits.state[1, 12, 0, :2] - log), abs=2e-3)
+    assert out["speed"] == pytest.approx(hits.state[1, 12, 0, 3], abs=0.006)
+
+
+@pytest.mark.slow
 def test_what_is_drawn_is_seen(tmp_path: Path) -> None:
-    save_rollouts(tmp_path / "sim", ABOUT, [crash()])
-    assert main(["view", str(tmp_path / "sim")]) == 0
+    for name, one in (("sim", crash()), ("other", crash())):
+        save_rollouts(tmp_path / name, ABOUT, [one])
+    assert main(["view", str(tmp_path / "sim"), str(tmp_path / "other")]) == 0
     shot = tmp_path / "shot.png"
     page = tmp_path / "sim" / "view.html"
-    browse(page, f"--screenshot={shot}", "--virtual-time-budget=8000", place="#rollout=1&t=2.4")
+    browse(page, f"--screenshot={shot}", "--virtual-time-budget=8000", place="#rollout=1&t=2.4&follow=ego")
     with Image.open(shot) as image:
-        pixels = np.asarray(image.convert("RGB")).reshape(-1, 3)
+        halves = np.asarray(image.convert("RGB"))[80:560, :880].reshape(480, 2, 440, 3).swapaxes(0, 1)
     for color in ((0x00, 0x72, 0xB2), (0xA9, 0xAE, 0xB5), (0xB3, 0x12, 0x2B), (0xF3, 0xF1, 0xEC)):
-        assert (np.abs(pixels.astype(int) - color).max(-1) < 6).sum() > 40, color
+        assert ((np.abs(halves.astype(int) - color).max(-1) < 6).sum((1, 2)) > 40).all(), color

@@ -497,7 +497,7 @@ def _read_rollouts(folder: Path, file: str) -> tuple[str, str]:
         if one_in(REPORTED, folder):
             told = report(found)
             told.plain()
-            write_view(found, told, folder / "view.html")
+            write_view([found], [told], folder / "view.html")
         RolloutWriter(place, found.about)
     except DataError:
         return REFUSED, ""

@@ -166,8 +166,8 @@ def run_suite(suite: Suite, out: Path, progress: Progress = None, *, view: bool 
             regressions += find_regressions(pair, before)
             if view:
                 folder = RolloutFolder(pair.folder)
-                replays = ((one, pair.report.events.get(one.segment.segment_id, [])) for one in folder)
-                write_file(pair.folder / "view.html", view_page(pair.name, replays, folder.about.settings))
+                replays = ([pair.report.replay(one)] for one in folder)
+                write_file(pair.folder / "view.html", view_page([pair.name], replays))
         result = Result(suite, pairs, verdicts, regressions, time.perf_counter() - began)
         write_json(out / "result.json", result.plain())
     return result

@@ -52,17 +52,14 @@ class Train(shared.Command):
 class Evaluate(shared.Simulation):
     """Simulate the interactive agents of every run segment and compare them with the log.
 
-    The log itself and agents at constant velocity are evaluated beside the agent. A run keeps what was found in its
-    folder, as evaluations/NAME.json, where `symphony table` looks for it; the same evaluation made again replaces it.
-    With --segments the folder of a run is left as it is.
+    The log itself and agents at constant velocity are evaluated beside the agent. A run keeps what was found as
+    evaluations/NAME.json in its folder, where `symphony table` looks for it; --segments leaves the folder as it is.
     """
 
     json: shared.Json = None
     figure: shared.ResultFile = None  # Picture (.png, .pdf or .svg) or animation (.gif) of some rollouts.
     save_rollouts: shared.Folder = None  # Folder for the rollouts that are evaluated (see `symphony view`).
-    #: Print every number of each agent, not only the table: kinds of collision, what the divergence owes to sampling,
-    #: where agents stand at the end, what a search made of the goals, and what becomes of single agents.
-    details: bool = False
+    details: bool = False  # Print every number of each agent, not only the table (see docs/metrics.md).
     keep: bool = True  # Leave the folder of the run as it is.
     #: More scores for the record and `symphony table`: `wosac` (2025), 32 rollouts of everyone (see docs/wosac.md).
     metrics: tuple[Literal["wosac"], ...] = ()
@@ -130,8 +127,7 @@ class Table(shared.Command):
     #: Setting of the table. `main`: 10 s, 2 interactive agents; `long`: 20 s, 2 agents; `many`: 10 s, 8 agents.
     setting: Setting
     runs: Annotated[shared.Paths, arg(metavar="DIR ...")]  # Folders of runs, or folders that hold some.
-    #: Names of evaluations, for runs that keep several in their folder `evaluations`; * and ? stand for anything. Of
-    #: several names, the first that fits one decides.
+    #: Names of evaluations, for runs that keep several; * and ? stand for anything, and the first that fits decides.
     evaluation: shared.Names = ()
     paper: PaperData | None = None  # Data set on which the paper's own figures are shown beside ours.
     format: TableFormat = "markdown"  # Format of the table.

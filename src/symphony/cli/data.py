@@ -165,8 +165,7 @@ class Convert(shared.Command):
     #: Metres from the ego's path within which map and agents are kept: for sources of whole districts (ScenarioNet).
     radius: Annotated[float | None, Bounds(sys.float_info.min)] = None
     exclude_overlaps: bool = False  # Leave out run segments in which a moving vehicle's box overlaps another.
-    #: Give lights their last known state (before it: the first) where the log knows none (see docs/formats.md).
-    hold_lights: bool = False
+    hold_lights: bool = False  # Lights keep their last known state where the log has none (docs/formats.md).
     strict: bool = False  # Skip a record of which something odd would be left out (an agent without a size).
     workers: shared.Workers = 1
     engine: shared.EngineName = "local"

@@ -26,8 +26,7 @@ class Planners(shared.Command):
     is at fault in a collision, runs a red light or leaves the road. Runs whose progress is not defined have none.
     """
 
-    #: Folders of rollouts that `symphony simulate --planner` made.
-    records: Annotated[Positional[shared.Paths], arg(metavar="SIM ...")]
+    records: shared.SavedFolders
     out: shared.ResultFile = None  # File to write the table to; otherwise it is printed.
     json: shared.Json = None
 

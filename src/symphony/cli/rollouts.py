@@ -29,8 +29,7 @@ class Simulate(shared.Simulation):
     #: There is no search unless --search, --branches or --trees say so.
     planner: Annotated[tuple[str, ...], arg(metavar="NAME [ID=NAME ...]")] = ()
     planner_seconds: float = 60.0  # Seconds that a planner has for one answer; a longer one fails the run.
-    #: Number of runs to simulate (a run is one rollout of one segment) in place of `rollouts`: evenly spread over the
-    #: segments, a few more where the number can't be divided so. 0: all segments, `rollouts` of each.
+    #: Least number of runs (rollouts of a segment), evenly spread over segments, in place of `rollouts`; 0: of all.
     runs: checks.Natural = 0
     #: Goals of agents, by their ids in the source: `7=lane:103` for a route over the lane of that id, `7=12.5,-40`
     #: for one that comes past a point (metres, in the frame of the segment); all others as the agent draws them.
@@ -77,47 +76,51 @@ class Simulate(shared.Simulation):
 class View(shared.Command):
     """Make a page that plays saved rollouts: it opens from disk in any browser, without a network.
 
-    Play, scrub, zoom, follow, click an agent; collisions are marked and listed; where a search was kept, its branches
-    with their scores and why they were pruned. With --out a picture or a film instead, by default of the first few
-    run segments.
+    Several folders play side by side, with metrics over time below; rollouts can be chosen by their events, plans and
+    branches of a search are drawn. With --out a picture or a film instead, by default of the first few run segments.
     """
 
-    folder: shared.Saved
-    #: File to write: a page (.html), a picture (.png, .pdf or .svg), an animation (.gif) or a film (.mp4, which
-    #: needs `pip install 'symphony-traffic[video]'`). By default view.html in the folder.
+    folders: shared.SavedFolders
+    #: File to write: .html (a page), .png, .pdf, .svg, .gif or .mp4 (with the extra `video`); view.html in the first.
     out: shared.ResultFile = None
     segments: shared.Segments = ()
-    #: Rollouts of each run segment in a picture or film, at most; 0: all in a picture, the first one in a film.
-    rollouts: checks.Natural = 0
+    rollouts: checks.Natural = 0  # Rollouts of a segment in a picture (0: all) or a film (0: one), at most.
 
     def __call__(self) -> None:
         from symphony.evaluation.report import report
         from symphony.render.style import FORMATS
         from symphony.saved.folder import load_rollouts
 
-        folder = load_rollouts(self.folder)
-        if self.segments:
-            folder = folder.only(folder.of(name).segment.segment_id for name in self.segments)
-        out = self.folder / "view.html" if self.out is None else self.out
+        folders, clips = [load_rollouts(path) for path in self.folders], []
+        names = list(dict.fromkeys(self.segments or (name for folder in folders for name in folder.ids)))
+        if lost := [name for name in names if not any(name in folder.ids for folder in folders)]:
+            folders[0].of(lost[0])  # says that there is none
+        folders = [folder.only(names) for folder in folders]
+        out = self.folders[0] / "view.html" if self.out is None else self.out
         with files.lock_file(out) if self.out is None else nullcontext():
             if out.suffix.lower() == ".html":
-                write_view(folder, report(folder, picked=True), out)
-            elif not (names := self.segments or folder.ids[:6]):
-                raise errors.ConfigError(f"{self.folder} holds no rollouts to draw")
+                write_view(folders, [report(folder, picked=True) for folder in folders], out)
+            elif not names:
+                raise errors.ConfigError(f"{self.folders[0]} holds no rollouts to draw")
             else:
                 count = self.rollouts or (None if out.suffix[1:].lower() in FORMATS else 1)
-                agent = " among ".join(map(shared.short_name, folder.about.agent.split(" among ")))
-                clips = [render.saved_clip(folder.of(name), count, f"{agent}: {name}") for name in names]
-                render.draw_clips(clips, out)
+                for name in names if self.segments else names[:6]:
+                    for folder in (folder for folder in folders if name in folder.ids):
+                        title = f"{shared.short_name(folder.about.agent)}: {name}"
+                        clips.append(render.saved_clip(folder.of(name), count, title))
+                render.draw_clips(clips, out, columns=len(folders) if len(folders) > 1 else 3)
         shared.say(f"written: {out}")
 
 
-def write_view(folder: Any, found: Any, out: Path) -> None:
-    """Write the page that plays the rollouts of a folder, with what the report of them found marked in it."""
+def write_view(folders: list[Any], reports: list[Any], out: Path) -> None:
+    """Write the page that plays the rollouts of folders, with what the reports of them found marked in it."""
     from symphony.render.viewer import view_page
 
-    replays = ((saved, found.events[saved.segment.segment_id]) for saved in folder)
-    files.write_file(out, view_page(folder.about.agent, replays, folder.about.settings))
+    pairs, several = list(zip(folders, reports, strict=True)), len(folders) > 1
+    names = [f"{one.path.name}: {one.about.agent}" if several else one.about.agent for one in folders]
+    ids = dict.fromkeys(name for folder in folders for name in folder.ids)
+    found = ([report.replay(of.of(name)) if name in of.ids else None for of, report in pairs] for name in ids)
+    files.write_file(out, view_page(names, found))
 
 
 class Report(shared.Command):
@@ -128,8 +131,7 @@ class Report(shared.Command):
 
     folder: shared.Saved
     out: shared.Folder = None  # Folder of the report; by default the same folder.
-    #: Agents that are evaluated: all that are driven, or only the ego.
-    evaluated: Literal["interactive", "ego"] = "interactive"
+    evaluated: Literal["interactive", "ego"] = "interactive"  # Evaluate all that are driven, or the ego.
     view: bool = True  # Leave the page that plays the rollouts unwritten.
 
     def __call__(self) -> None:
@@ -146,7 +148,7 @@ class Report(shared.Command):
             files.write_file(out / "report.csv", found.csv())
             files.write_file(out / "report.html", report_page(plain, "view.html" if self.view else None))
             if self.view:
-                write_view(folder, found, out / "view.html")
+                write_view([folder], [found], out / "view.html")
         rows, runs, failed, segments = [], plain["runs"], plain["failed_runs"], totals["segments"]
         for name in (name for name in totals if f"{name}_se" in totals):
             cell = shared.number_cell(totals[name], totals[f"{name}_se"], 2, totals.get(f"{name}_bound"))
@@ -176,8 +178,7 @@ class Export(shared.Command):
         if self.format == "json":
             suffix = "json"
             write = lambda *of: json.dumps(to_dict(*of), ensure_ascii=False, allow_nan=False) + "\n"  # noqa: E731
-        out = self.out or self.folder / "export"
-        with files.Lock(out / "export.lock"):
+        with files.Lock((out := self.out or self.folder / "export") / "export.lock"):
             for name in self.segments or folder.ids:
                 saved = folder.of(name)
                 for k in self.rollouts or range(saved.rollouts):

@@ -29,6 +29,8 @@ _JSON = "File to write all numbers to as JSON; - for standard output, and nothin
 Json = Annotated[Path | None, Result(), arg(metavar="FILE", help=_JSON)]
 Picture = Annotated[Path, Result(), arg(metavar="FILE", help="Picture to write (.png, .pdf or .svg).")]
 Store = Annotated[Positional[Path], arg(metavar="DIR", help="Folder of the store.")]
+_SAVED = "Folders of rollouts (`symphony simulate`), such as those of several planners."
+SavedFolders = Annotated[Positional[Paths], checks.Bounds(distinct=True), arg(metavar="SIM ...", help=_SAVED)]
 Saved = Annotated[Positional[Path], arg(metavar="SIM", help="Folder of rollouts (`symphony simulate`).")]
 _SEGMENTS = "Ids of run segments, or their numbers in the store, to use no others."
 Segments = Annotated[tuple[str, ...], arg(metavar="ID ...", help=_SEGMENTS)]
@@ -180,8 +182,8 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, details: b
 
 
 def short_name(agent: str) -> str:
-    """An agent's name as tables show it: that of its folder."""
-    return agent.rpartition("/")[2] or agent
+    """An agent's name as tables show it, or that of a planner among agents: the names of folders alone."""
+    return " among ".join(part.rpartition("/")[2] or part for part in agent.split(" among "))
 
 
 def number_cell(value: float | None, error: float | None, digits: int, bound: float | None = None) -> str:

@@ -22,7 +22,7 @@ from symphony.evaluation import driving
 from symphony.evaluation.contacts import Contacts, at_fault, contacts, time_to_collision
 from symphony.metrics import CollisionKind
 from symphony.metrics.intervals import grouped_mean, zero_bound
-from symphony.render.viewer import Event
+from symphony.render.viewer import Event, Replay
 from symphony.saved.folder import RolloutFolder
 from symphony.saved.rollouts import SavedRollouts, world_of
 
@@ -65,6 +65,12 @@ class Report:
     # By kind, type of the other, fault, and whether the other played back the log.
     collisions: Counter[tuple[str, str, bool, bool]] = field(default_factory=Counter)
     events: dict[str, list[Event]] = field(default_factory=dict)  # of each segment, marked in its replay
+    collision_in: dict[str, Array] = field(default_factory=dict)  # of each segment, seconds [K, T, N]
+
+    def replay(self, saved: SavedRollouts) -> Replay:
+        """Return what a viewer shows of a segment; nothing is marked in one that was not evaluated."""
+        name = saved.segment.segment_id
+        return Replay(saved, self.events.get(name, ()), self.collision_in.get(name))
 
     def worst(self) -> list[Row]:
         """Return the runs, worst first; equal ones in their order."""
@@ -94,7 +100,7 @@ class Report:
 def report(
     folder: RolloutFolder,
     evaluated: Evaluated = "interactive",
-    progress_bar: Callable[[int, int], None] | None = None,
+    progress_bar: Callable[[int, int], None] = lambda done, total: None,
     *,
     picked: bool = False,
 ) -> Report:
@@ -103,13 +109,11 @@ def report(
     is called with the segments done and their total.
     """
     if not picked and "hunt" in folder.about.settings:
-        why = "`symphony hunt` picked runs that fail: see them, but count nothing"
-        raise DataError(why, file=folder.path)
+        raise DataError("`symphony hunt` picked runs that fail: see them, count nothing", file=folder.path)
     found = Report(folder.about.agent, evaluated)
     for number, saved in enumerate(folder):
         add_segment(found, saved)
-        if progress_bar is not None:
-            progress_bar(number + 1, len(folder))
+        progress_bar(number + 1, len(folder))
     for lost in folder.failures:
         about = {"segment": lost.segment, "group": lost.group or lost.segment, "failed": lost.failed}
         found.rows += [dict.fromkeys(NUMBERS) | about | {"rollout": k} for k in range(lost.rollouts)]
@@ -123,7 +127,8 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
         who = np.flatnonzero(saved.agents == segment.ego)
         if not len(who):
             raise DataError("the ego was not driven", segment=name, field="agents")
-    rows, lanes, events = saved.agents[who], driving.Lanes(segment), list[Event]()
+    rows, lanes = saved.agents[who], driving.Lanes(segment)
+    found.events[name], found.collision_in[name] = [], np.full(saved.counted.shape, math.inf)
     driven, compared, of_log = driving.progress(saved, who, lanes)
     acceleration, jerk, lateral = driving.comfort(saved, who)
     distance, logged = driving.log_distance(saved, who)
@@ -139,6 +144,7 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
         lights = driving.Lights(*(part[np.isin(lights.agent, rows)] for part in lights))
         marked = _events(k, hits, fault, lights, rows, {"offroad": off, "blocking": stands})
         ttc = np.where(counted, time_to_collision(world, rows)[:, 1:], math.inf)
+        found.collision_in[name][k][:, who] = ttc.T
         steps = int(counted.sum())
         lane_steps = steps * (len(lanes.graph.usable_lanes) > 0)
         # Of an agent whose progress is not defined, the log's does not count either.
@@ -173,11 +179,10 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
             "logged_steps": int(logged[k]),
         }
         found.rows.append(numbers)
-        events += marked
+        found.events[name] += marked
         for hit in (event for event in marked if event.kind == "collision" and k not in saved.failed):
             other = AgentType(segment.agent_type[hit.other]).name.lower()
             found.collisions[hit.text, other, bool(hit.fault), hit.other not in saved.agents] += 1
-    found.events[name] = events
 
 
 def _events(
@@ -226,9 +231,8 @@ def total_numbers(rows: Sequence[Row]) -> Row:
     out: Row = {"runs": len(rows), "failed_runs": len(rows) - len(good)}
     out |= {"segments": len({row["segment"] for row in rows}), "groups": len(names)}
     for name, (of, scale, by) in _MEANS.items():
-        seen = [bool(row[of]) if of == "red_lights" else row[of] or 0.0 for row in good]
-        counts = [(1.0 if by is None else row[by]) * (row[of] is not None) for row in good]
-        value, weight = np.array(seen, np.float64), np.array(counts, np.float64)
+        value = np.array([bool(row[of]) if of == "red_lights" else row[of] or 0.0 for row in good], float)
+        weight = np.array([(1.0 if by is None else row[by]) * (row[of] is not None) for row in good], float)
         out[name], out[f"{name}_se"] = grouped_mean(scale * value, weight, member)
         has = weight > 0
         out[f"{name}_segments"] = len({row["segment"] for row, some in zip(good, has, strict=True) if some})

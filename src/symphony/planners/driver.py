@@ -28,6 +28,7 @@ from symphony.planners.included import IDMPlanner
 from symphony.planners.interface import (
     Planner,
     Planners,
+    Reals,
     Traffic,
     checked_plan,
     fixed,
@@ -36,6 +37,8 @@ from symphony.planners.interface import (
     scenario_of,
 )
 from symphony.streams import Stream, fold_in
+
+POINTS = 20  # of a trajectory that are kept, at most
 
 
 class PlannedEnv(DrivingEnv):
@@ -148,6 +151,11 @@ class EgoPolicy(TensorDictModuleBase):
         each = (one.failures(part) for one, part in zip(self.drivers, number.unbind(-1), strict=True))
         return [min(filter(None, found), default=None) for found in zip(*each, strict=True)]
 
+    def meant(self, number: Int[Tensor, "*b P"], steps: int) -> NDArray[np.float32] | None:
+        """The trajectories [*b, T, H, 2] that planners of the ego gave back, NaN for none; None without any."""
+        first = self.drivers[0]
+        return first.meant(number[..., 0], steps) if isinstance(first, _Asked) else None
+
 
 class _Driver:
     """Of each scene the agent at a place among the interactive ones: its row, and words before its failures."""
@@ -210,6 +218,7 @@ class _Asked(_Driver):
         super().__init__(env, egos, place)
         self._last = env.scenes.last_step.cpu().numpy()
         self._held: dict[int, Planner | Failure] = {}
+        self._meant: dict[int, dict[int, NDArray[np.float32]]] = {}
         scene = start.get(keys.SCENE).flatten().tolist()
         state = start.get(keys.STATE)[..., place, :].reshape(-1, 4).cpu().numpy()
         own = fold_in(fold_in(start.get(keys.STREAM), Stream.PLANNERS), seed)
@@ -225,6 +234,7 @@ class _Asked(_Driver):
             error = error or answer(planner.reset, made, seconds=egos.seconds)
             failed = isinstance(error, Exception)
             self._held[number] = self._failure(row, 0, "reset", error) if failed else planner
+            self._meant[number] = {}
         self._next = len(scene)
         drives = next((held for held in self._held.values() if not isinstance(held, Failure)), None)
         if forked and drives is not None:
@@ -264,9 +274,8 @@ class _Asked(_Driver):
             planner = self._held[numbers[m]]
             if going[m] and not isinstance(planner, Failure):
                 ahead = route_from(self._routes[row], come[m])
-                asked.append(
-                    (m, planner, self._traffic(row, steps[m], own[m].numpy(), moves[m], present[m], ahead))
-                )
+                seen = self._traffic(row, steps[m], own[m].numpy(), moves[m], present[m], ahead)
+                asked.append((m, planner, seen))
         plans = plans_of([one[1] for one in asked], [one[2] for one in asked], self.egos.seconds)
         # One that is over, or has failed, keeps its speed.
         control, target = np.zeros((len(rows), 2)), np.full((len(rows), 4), np.nan)
@@ -278,6 +287,8 @@ class _Asked(_Driver):
                 self._held[numbers[m]] = self._failure(rows[m], steps[m], f"step {steps[m]}", found)
             else:
                 (control if len(found) == 2 else target)[m] = found
+                if np.ndim(given) == 2:
+                    self._meant[numbers[m]][steps[m]] = _shown(given)
         length = [float(self.egos.segments[row].size[self.rows[row], 0]) for row in rows]
         pulled, turned = torch.from_numpy(control).unbind(-1)
         after = bicycle_step(own, pulled, turned, torch.tensor(length, dtype=torch.float64), self.env.dt)
@@ -290,9 +301,20 @@ class _Asked(_Driver):
         found = (self._held[n] for n in number.flatten().tolist())
         return [planner if isinstance(planner, Failure) else None for planner in found]
 
+    def meant(self, number: Int[Tensor, "*b"], steps: int) -> NDArray[np.float32] | None:
+        """See :meth:`EgoPolicy.meant`."""
+        given = [self._meant[n] for n in number.flatten().tolist()]
+        most = max((len(plan) for plans in given for plan in plans.values()), default=0)
+        found = np.full((len(given), steps, most, 2), np.nan, np.float32)
+        for row, plans in zip(found, given, strict=True):
+            for step in plans.keys() & {*range(steps)}:
+                row[step, : len(plans[step])] = plans[step]
+        return found if most else None
+
     def _own(self, numbers: list[int], going: list[bool]) -> list[int]:
         """Numbers of planners that may be changed, one for each rollout that goes on."""
         self._held = {n: self._held[n] for n in set(numbers)}
+        self._meant = {n: self._meant[n] for n in set(numbers)}
         taken: set[int] = set()
         out = []
         for number, goes in zip(numbers, going, strict=True):
@@ -300,7 +322,7 @@ class _Asked(_Driver):
             if goes and not isinstance(planner, Failure):
                 if number in taken:
                     chosen, self._next = self._next, self._next + 1
-                    self._held[chosen] = self._copy(planner)
+                    self._held[chosen], self._meant[chosen] = self._copy(planner), {**self._meant[number]}
                 taken.add(chosen)
             out.append(chosen)
         return out
@@ -314,15 +336,7 @@ class _Asked(_Driver):
                 "branches: simulate with --search none"
             ) from error
 
-    def _traffic(
-        self,
-        row: int,
-        step: int,
-        own: NDArray[Any],
-        moves: NDArray[Any],
-        there: NDArray[Any],
-        route: NDArray[Any],
-    ) -> Traffic:
+    def _traffic(self, row: int, step: int, own: Reals, moves: Reals, there: Any, route: Reals) -> Traffic:
         segment = self.egos.segments[row]
         there = there[: segment.num_agents]
         moves = np.where(there[:, None], moves[: segment.num_agents], 0.0)
@@ -352,6 +366,12 @@ def route_from(route: NDArray[np.float32], progress: float) -> NDArray[np.float6
     # The last piece may be shorter than the others.
     share = min((progress - SPACING * piece) / max(float(np.hypot(*way)), 1e-6), 1.0)
     return np.concatenate([(route[piece] + share * way)[None], later])
+
+
+def _shown(plan: Any) -> NDArray[np.float32]:
+    """Points [H, 2] of a trajectory, at most :data:`POINTS` of them, the last among them."""
+    points = np.asarray(plan, np.float32)[:, :2]
+    return points[np.linspace(0, len(points) - 1, min(len(points), POINTS)).round().astype(int)]
 
 
 def _words(error: Exception) -> str:

@@ -123,10 +123,8 @@ class ProcessPlanner:
         while b"\n" not in line:
             part = os.read(pipe.fileno(), 1 << 16)
             if not part:
-                status = self._ended()
-                raise RuntimeError(
-                    f"the planner's process ended (status {status}) without an answer to {what}"
-                )
+                how = f"ended (status {self._ended()}) without an answer to {what}"
+                raise RuntimeError(f"the planner's process {how}")
             line += part
             if len(line) > LONGEST:
                 raise ValueError(f"an answer of more than {LONGEST} bytes")

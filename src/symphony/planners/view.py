@@ -92,46 +92,27 @@ def lanes_of(scenario: Scenario) -> tuple[Lane, ...]:
     after: dict[int, list[int]] = {}
     for one, other in road.successors.tolist():
         after.setdefault(one, []).append(int(road.lane_id[other]))
-    return tuple(
-        Lane(
-            int(road.lane_id[k]),
-            fixed(road.lanes[k][:, :2].astype(np.float64)),
-            float(road.speed_limit[k]),
-            tuple(after.get(k, ())),
-        )
-        for k in range(len(road.lanes))
-    )
+    lines = [fixed(road.lanes[k][:, :2].astype(np.float64)) for k in range(len(road.lanes))]
+    parts = zip(road.lane_id.tolist(), lines, road.speed_limit.tolist(), strict=True)
+    return tuple(Lane(*part, tuple(after.get(k, ()))) for k, part in enumerate(parts))
 
 
 def observation_of(scenario: Scenario, traffic: Traffic, lanes: tuple[Lane, ...]) -> Observation:
     """One record of what a planner is told at the start and what it observes now."""
     there = traffic.valid.copy()
     there[traffic.ego] = False
-    position, velocity, size = traffic.position[there], traffic.velocity[there], traffic.size[there]
+    (x, y), (vx, vy) = traffic.position[there].T, traffic.velocity[there].T
+    (length, width), at = traffic.size[there].T, scenario.signal_point
+    kinds, controlled = TYPES[traffic.agent_type[there]], scenario.road.lane_id[scenario.signal_lane]
     return Observation(
         time=traffic.time,
         dt=scenario.dt,
         step=traffic.step,
         ego=Ego(*traffic.state.tolist(), *scenario.size.tolist()),
-        agents=Agents(
-            x=position[:, 0],
-            y=position[:, 1],
-            heading=traffic.heading[there],
-            vx=velocity[:, 0],
-            vy=velocity[:, 1],
-            length=size[:, 0],
-            width=size[:, 1],
-            type=TYPES[traffic.agent_type[there]],
-            id=scenario.agent_id[there],
-        ),
+        agents=Agents(x, y, traffic.heading[there], vx, vy, length, width, kinds, scenario.agent_id[there]),
         route=traffic.route,
         lanes=lanes,
-        lights=Lights(
-            x=scenario.signal_point[:, 0],
-            y=scenario.signal_point[:, 1],
-            lane=scenario.road.lane_id[scenario.signal_lane].astype(np.int64),
-            state=STATES[traffic.lights],
-        ),
+        lights=Lights(at[:, 0], at[:, 1], controlled.astype(np.int64), STATES[traffic.lights]),
         segment_id=scenario.segment_id,
         seed=scenario.seed,
     )

@@ -97,31 +97,18 @@ def plot_segment(
 
 @dataclass
 class Clip:
-    """K rollouts of N agents of a run segment, to be drawn or animated; padding among the agents is left out.
+    """K rollouts of N agents of a run segment, to be drawn or animated; padding among the agents is left out."""
 
-    Attributes:
-        segment: the log.
-        position: [K, N, T, 2] simulated box centres, metres.
-        heading: [K, N, T] radians.
-        agents: [N] which agents of the segment these are; negative for padding.
-        start: step of the log at which the rollouts begin.
-        valid: [K, N, T] bool, or [N, T], all by default; steps that are not, or not finite, are left out.
-        collision: [K, N, T] bool, marked where each collision begins; by default none is known.
-        offroad: [K, N, T] bool, marked where each departure from the road begins.
-        view: limits in metres; by default around rollouts and log of those agents.
-        title: by default the segment's id.
-    """
-
-    segment: RunSegment
-    position: NDArray[Any]
-    heading: NDArray[Any]
-    agents: Any
-    start: int = 0
-    valid: Any = True
-    collision: Any = False
-    offroad: Any = False
-    view: View | None = None
-    title: str | None = None
+    segment: RunSegment  # the log
+    position: NDArray[Any]  # [K, N, T, 2] simulated box centres, metres
+    heading: NDArray[Any]  # [K, N, T] radians
+    agents: Any  # [N] which agents of the segment these are; negative for padding
+    start: int = 0  # step of the log at which the rollouts begin
+    valid: Any = True  # [K, N, T] or [N, T]; steps that are not, or not finite, are left out
+    collision: Any = False  # [K, N, T], marked where each collision begins; by default none is known
+    offroad: Any = False  # [K, N, T], marked where each departure from the road begins
+    view: View | None = None  # limits in metres; by default around rollouts and log of those agents
+    title: str | None = None  # by default the segment's id
 
     def __post_init__(self) -> None:
         agents = np.asarray(self.agents, np.int64)

@@ -136,17 +136,11 @@ def font(axes: Axes, size: float, text: str = "") -> float:
     return max(3.0, min(size * float(np.clip(_width(axes) / 5, 0.6, 1)), room))
 
 
-def scale_length(span: float) -> float:
-    """A round length (1, 2 or 5 times a power of ten) of at most a fifth of the span, both in metres."""
-    raw = span / 5
-    power = 10.0 ** math.floor(math.log10(raw))
-    return max(step * power for step in (1, 2, 5) if step * power <= raw)
-
-
 def add_scale_bar(axes: Axes, view: View) -> None:
-    """A bar of a round length in the lower left corner."""
+    """A bar of a round length (1, 2 or 5 times a power of ten metres) in the lower left corner."""
     span = max(view[1] - view[0], view[3] - view[2])
-    length = scale_length(span)
+    power = 10.0 ** math.floor(math.log10(span / 5))
+    length = max(step * power for step in (1, 2, 5) if step * power <= span / 5)
     style: dict[str, Any] = {"pad": 0.4, "borderpad": 0.6, "sep": 4, "frameon": True, "color": INK}
     style |= {"size_vertical": span / 250, "fontproperties": FontProperties(size=font(axes, 8.5))}
     bar = AnchoredSizeBar(axes.transData, length, f"{length:g} m", "lower left", **style)

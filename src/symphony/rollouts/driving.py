@@ -54,6 +54,7 @@ class Simulation(NamedTuple):
         steps: that were simulated for them, each of a rollout or branch.
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
         drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
+        meant: per scene, trajectories [K, T, H, 2] that its planners gave back; None for none.
     """
 
     rollouts: Rollouts
@@ -63,6 +64,7 @@ class Simulation(NamedTuple):
     steps: int = 0
     failed: tuple[dict[int, str], ...] = ()
     drawn: Int[Tensor, "B trees S N"] | None = None
+    meant: tuple[Any, ...] = ()
 
 
 def simulation(
@@ -251,7 +253,8 @@ def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Si
     going = torch.arange(steps, device=number.device) < torch.tensor(until, device=number.device)[..., None]
     failed = tuple({k: one.reason for k, one in enumerate(row) if one is not None} for row in each)
     kept = found.rollouts._replace(counted=found.rollouts.counted & going[..., None])
-    return found._replace(rollouts=kept, failed=failed)
+    meant = tuple(planned.meant(row, steps) for row in number)
+    return found._replace(rollouts=kept, failed=failed, meant=meant)
 
 
 def beside_planner(config: EvaluateConfig) -> EvaluateConfig:

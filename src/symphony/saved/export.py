@@ -31,17 +31,17 @@ _COLORS = {"STOP": "red", "CAUTION": "yellow", "GO": "green"}
 def commonroad(saved: SavedRollouts, rollout: int) -> str:
     """A rollout as a CommonRoad scenario.
 
-    Every agent is a dynamic obstacle with the id it has in the source (all shifted alike if some are not positive);
-    each further stretch of steps at which it is seen is another. Lanelets are nominally wide where the log does not
-    say; lanes of a single point are left out. Lights that flash or are not known are inactive.
+    Agents are dynamic obstacles with their ids of the source (all shifted alike if some are not positive), others for
+    each further stretch of steps at which they are seen. Lanelets are nominally wide where the log does not say, and
+    none where it has a lane of a single point. Lights that flash or are not known are inactive.
     """
     segment = saved.segment
     letters = "".join(word.capitalize() for word in re.findall("[A-Za-z]+", segment.segment_id)) or "Segment"
     number = 1 + zlib.crc32(segment.segment_id.encode()) % 999_999  # names hold nothing else
     name = f"ZAM_{letters[:60]}-{number}_{rollout + 1}_T-1"
     about = {"commonRoadVersion": "2020a", "benchmarkID": name, "timeStepSize": repr(float(segment.dt))}
-    about |= {"author": "", "affiliation": ""}
-    about["source"] = f"symphony: segment {segment.segment_id}, rollout {rollout}"
+    source = f"symphony: segment {segment.segment_id}, rollout {rollout}"
+    about |= {"author": "", "affiliation": "", "source": source}
     root = ET.Element("commonRoad", about, date="1970-01-01")
     location = _add(root, "location")
     for tag, value in (("geoNameId", "-999"), ("gpsLatitude", "999"), ("gpsLongitude", "999")):
@@ -119,8 +119,7 @@ class _Network:
         """Add all elements in the order that the format wants."""
         limits = {k: float(self.road.speed_limit[k]) for k in self.lines}
         signs = {limit: next(self.number) for limit in sorted({x for x in limits.values() if np.isfinite(x)})}
-        # Id, row, lanes that lead to it, and the direction it is for: the format hangs a light on the lane before it
-        # and tells turns apart by direction.
+        # Id, row, lanes before it, where the format hangs lights, and the direction, which tells its turns apart.
         lights: list[tuple[int, int, list[int], str]] = []
         for light, lane in enumerate(self.segment.signal_lane.tolist()):
             if lane in self.lines:
@@ -220,13 +219,12 @@ def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
                 flags = getattr(saved, name)[rollout, :, n] & saved.counted[rollout, :, n]
                 agent[name] = (1 + np.flatnonzero(flags)).tolist()
         agents.append(agent)
-
     road = {name: getattr(segment.road, name) for name in ("lanes", "boundary", "marks")}
     plain = {name: [(x[k][:, :2] + origin).tolist() for k in range(len(x))] for name, x in road.items()}
     lights = []
     for light, lane in enumerate(segment.signal_lane.tolist()):
-        shown = segment.signal_state[light, saved.start : saved.last + 1].tolist()
-        names = [SignalState(state).name.lower() for state in shown]
+        shown = segment.signal_state[light, saved.start : saved.last + 1]
+        names = [SignalState(state).name.lower() for state in shown.tolist()]
         stop = (segment.signal_point[light, :2] + origin).tolist()
         lights.append({"lane": lane, "stop": stop, "states": names})
     found: dict[str, Any] = {"segment": segment.segment_id, "rollout": rollout, "dt": float(segment.dt)}

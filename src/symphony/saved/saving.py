@@ -62,8 +62,7 @@ def save_simulation(
     settings = plain_settings(config, agent, dataset.interactive, dataset.duration)
     settings |= {"goal": list(goals)} if goals else {}
     settings |= planner_settings(planners, planner_seconds)  # complains before anything is simulated
-    name = planner_name(planner) if planner else ""
-    about = About.of(agent.name, dataset.store, settings, seed=config.seed, planner=name)
+    about = About.of(agent.name, dataset.store, settings, seed=config.seed, planner=planner_name(planner))
     with RolloutWriter(path, about) as writer:
         names = [dataset.store.ids[i] for i in dataset.indices]
         todo = [i for i, segment in enumerate(names) if not writer.has(segment)]
@@ -106,8 +105,8 @@ def _drive(
         about["search"] = found.search if keep_tree else None
         saved = []
         for b, segment in enumerate(segments):
-            failed = found.failed[b] if found.failed else None
-            saved.append(saved_rollouts(segment, on_cpu, rollouts, b, failed=failed, **about))
+            failed, plan = (found.failed[b], found.meant[b]) if found.failed else (None, None)
+            saved.append(saved_rollouts(segment, on_cpu, rollouts, b, failed=failed, plan=plan, **about))
         return saved
 
 

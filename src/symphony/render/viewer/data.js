@@ -26,8 +26,11 @@ function decode(buffer, start, item) {
   return out;
 }
 
+// A block of the page; null where there is none.
 async function unpack(id) {
-  const buffer = await inflate(fromBase64(document.getElementById(id).textContent));
+  const block = document.getElementById(id);
+  if (!block) return null;
+  const buffer = await inflate(fromBase64(block.textContent));
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
   const data = { ...header.facts }, start = 4 + length;
@@ -35,7 +38,7 @@ async function unpack(id) {
   return data;
 }
 
-// One segment: what was logged and what was simulated, by agent, rollout and time.
+// One segment: what was logged and what one planner made of it, by agent, rollout and time.
 class Replay {
   constructor(data) {
     Object.assign(this, data);
@@ -68,6 +71,19 @@ class Replay {
   logged(row, t) { return this.at("log", row, t); }
   simulated(k, n, t) { return this.at("sim", k * this.agents.length + n, t); }
   state(k, row, t) { return this.rank.has(row) ? this.simulated(k, this.rank.get(row), t) : this.logged(row, t); }
+
+  // Seconds to a collision at state t of a rollout; NaN where there is none in sight.
+  collisionIn(k, row, t) {
+    if (!this.ttc || !this.rank.has(row) || !t) return NaN;
+    const seconds = this.ttc[(k * this.agents.length + this.rank.get(row)) * this.steps + t - 1];
+    return seconds > 10.1 ? NaN : seconds;
+  }
+  // What the planner of the ego meant to come past, said at state t, as [x, y].
+  plan(k, t) {
+    const at = k * this.steps + t, count = this["plan.count"] && t < this.steps ? this["plan.count"][at] : 0;
+    const most = count && this["plan.x"].length / this["plan.count"].length;
+    return Array.from({ length: count }, (_, h) => [this["plan.x"][at * most + h], this["plan.y"][at * most + h]]);
+  }
 
   line(name, k) {
     const from = this[name + ".offsets"][k], to = this[name + ".offsets"][k + 1];

@@ -1,36 +1,71 @@
 // The page: what is shown, and what the user does.
 const $ = id => document.getElementById(id);
 const about = JSON.parse($("about").textContent);
-const camera = new Camera(), canvas = $("canvas"), context = canvas.getContext("2d");
-const LAYERS = { log: "log ghosts", routes: "routes, goals", trails: "ways", rollouts: "other rollouts", lights: "lights", labels: "ids" };
-const view = { segment: 0, rollout: 0, t: 0, playing: false, speed: 1, agent: null, follow: null, events: [], branch: null,
-  layers: { log: true, routes: true, trails: true, rollouts: false, lights: true, labels: false } };
-let scene = null, search = null, dirty = true, last = 0;
+const camera = new Camera();
+const LAYERS = { log: "log ghosts", routes: "routes, goals", trails: "ways", rollouts: "other rollouts", plan: "plan", lights: "lights", labels: "ids" };
+const FILTERS = { "": "any events", collision: "a collision", fault: "a collision at fault", offroad: "time off the road", redlight: "a red light run", blocking: "blocked traffic", failed: "a failure" };
+const view = { segment: 0, rollout: 0, t: 0, playing: false, speed: 1, agent: null, follow: null, events: [], branch: null, filter: "",
+  layers: { log: true, routes: true, trails: true, rollouts: false, plan: true, lights: true, labels: false } };
+// Those whose rollouts are shown side by side; `shown`, `scene` and `search` are of the one that was clicked last.
+const panes = about.names.map((name, p) => {
+  const box = document.createElement("div"), canvas = document.createElement("canvas");
+  box.className = "pane"; canvas.tabIndex = 0; canvas.setAttribute("aria-label", `Replay of ${name}`);
+  box.append(canvas);
+  if (about.names.length > 1) box.insertAdjacentHTML("beforeend", `<h3><b style="background:${PALETTE[p % PALETTE.length]}"></b>${escapeText(name)}</h3>`);
+  $("panes").append(box);
+  return { name, box, canvas, context: canvas.getContext("2d"), color: PALETTE[p % PALETTE.length], scene: null, events: [] };
+});
+let shown = panes[0], scene = null, search = null, dirty = true, last = 0;
 const cache = new Map();
+
+async function scenesOf(segment) {
+  const log = await unpack(`segment-${segment}`), blocks = await Promise.all(panes.map((_, p) => unpack(`segment-${segment}-${p}`)));
+  return blocks.map(block => block && new Scene(new Replay({ ...log, ...block })));
+}
 
 async function open(segment, wanted = {}) {
   view.segment = segment;
   if (!cache.has(segment)) {
     if (cache.size > 12) cache.delete(cache.keys().next().value);
-    cache.set(segment, new Scene(new Replay(await unpack(`segment-${segment}`))));
+    cache.set(segment, await scenesOf(segment));
   }
   if (view.segment !== segment) return;
-  scene = cache.get(segment);
+  panes.forEach((pane, p) => { pane.scene = cache.get(segment)[p]; });
+  view.agent = null; view.follow = null; view.branch = null;
+  show(shown.scene ? shown : panes.find(pane => pane.scene));
   const r = scene.replay;
   $("segment").value = segment;
-  $("rollout").innerHTML = Array.from({ length: r.rollouts }, (_, k) => `<option value="${k}">${k}${rolloutNote(r, k)}</option>`).join("");
   $("facts").textContent = `${r.source} · ${(r.steps * r.dt).toFixed(1)} s at ${+(1 / r.dt).toFixed(2)} Hz · ${r.size.length / 2} agents, ${r.agents.length} driven`;
   $("time").max = r.steps;
-  view.agent = null; view.follow = null; view.branch = null;
   $("follow").innerHTML = `<option value="">nobody</option>` + Array.from(new Set([r.ego, ...r.agents]), row => `<option value="${row}">${followName(r, row)}</option>`).join("");
-  search = r.branches ? new SearchPanel(r, $("tree")) : null;
-  $("search").hidden = !search;
-  legend(r);
   resize();
   fit();
   seek(wanted.step || 0);
-  choose(Math.min(wanted.rollout || 0, r.rollouts - 1));
+  const numbers = rolloutsWith(segment);
+  choose(numbers.includes(wanted.rollout) ? wanted.rollout : numbers[0] || 0);
   if (wanted.agent !== undefined) select(wanted.agent);
+}
+
+// The one of the panes that the panels beside the map are about.
+function show(pane) {
+  shown = pane; scene = pane.scene;
+  const r = scene.replay;
+  panes.forEach(one => one.box.classList.toggle("active", one === pane));
+  $("rollout").innerHTML = rolloutsWith(view.segment).map(k => `<option value="${k}">${k}${rolloutNote(r, k)}</option>`).join("");
+  search = r.branches ? new SearchPanel(r, $("tree")) : null;
+  $("search").hidden = !search;
+  legend(r);
+}
+
+// Numbers of the rollouts of a segment in which, for any planner, there is what is asked for.
+function rolloutsWith(segment) {
+  const kinds = about.segments[segment].kinds.filter(one => one), most = Math.max(...kinds.map(one => one.length));
+  return Array.from({ length: most }, (_, k) => k).filter(k => !view.filter || kinds.some(one => one[k] && one[k].includes(view.filter)));
+}
+function listSegments() {
+  const numbers = about.segments.map((_, i) => i).filter(i => rolloutsWith(i).length);
+  $("segment").innerHTML = numbers.map(i => `<option value="${i}">${escapeText(about.segments[i].id)}</option>`).join("");
+  return numbers;
 }
 
 const followName = (r, row) => `${r.rank.has(row) || row === r.ego ? r.kind(row) : "agent"} ${escapeText(r.ids[row])}`;
@@ -42,9 +77,11 @@ function rolloutNote(r, k) {
 }
 
 function choose(rollout) {
-  const r = scene.replay;
   view.rollout = rollout; view.branch = null;
-  view.events = r.events.filter(e => e.rollout === rollout).sort((a, b) => a.step - b.step);
+  for (const pane of panes) pane.events = pane.scene ? pane.scene.replay.events.filter(e => e.rollout === rollout).sort((a, b) => a.step - b.step) : [];
+  if (!has(shown)) show(panes.find(has));
+  const r = scene.replay;
+  view.events = shown.events;
   $("rollout").value = rollout;
   $("eventcount").textContent = view.events.length ? `(${view.events.length})` : "";
   $("events").innerHTML = (r.failed[rollout] ? `<li class="fault">broke off: ${escapeText(r.failed[rollout])}</li>` : "") +
@@ -54,6 +91,7 @@ function choose(rollout) {
   if (search) $("searchfacts").textContent = `tree ${search.treeOf(rollout)}: ${r.branches} branches, pruned every ${(r.prune_every * r.dt).toFixed(1)} s`;
   remember(); dirty = true;
 }
+const has = pane => pane.scene && view.rollout < pane.scene.replay.rollouts;
 
 function seek(t) { view.t = Math.min(Math.max(t, 0), scene.replay.steps); dirty = true; }
 function select(row) {
@@ -84,16 +122,31 @@ function fit() {
   const r = scene.replay;
   let box = [Infinity, -Infinity, Infinity, -Infinity];
   const add = (x, y, seen) => { for (let i = 0; i < x.length; i++) if (seen[i]) box = [Math.min(box[0], x[i]), Math.max(box[1], x[i]), Math.min(box[2], y[i]), Math.max(box[3], y[i])]; };
-  add(r["sim.x"], r["sim.y"], r["sim.valid"]);
+  for (const pane of panes) if (pane.scene) { const s = pane.scene.replay; add(s["sim.x"], s["sim.y"], s["sim.valid"]); }
   if (!Number.isFinite(box[0])) add(r["log.x"], r["log.y"], r["log.valid"]);
   const m = 22;
   camera.fit([box[0] - m, box[1] + m, box[2] - m, box[3] + m]);
   dirty = true;
 }
 function resize() {
-  camera.width = canvas.clientWidth; camera.height = canvas.clientHeight; camera.ratio = window.devicePixelRatio || 1;
-  canvas.width = Math.round(camera.width * camera.ratio); canvas.height = Math.round(camera.height * camera.ratio);
+  camera.width = shown.canvas.clientWidth; camera.height = shown.canvas.clientHeight; camera.ratio = window.devicePixelRatio || 1;
+  for (const { canvas } of panes) { canvas.width = Math.round(camera.width * camera.ratio); canvas.height = Math.round(camera.height * camera.ratio); }
   dirty = true;
+}
+// The camera as a pane has it: with the agent that is followed in its middle.
+function aim(pane) {
+  const state = view.follow === null ? null : pane.scene.replay.state(view.rollout, view.follow, view.t);
+  if (state) { camera.x = state.x; camera.y = state.y; }
+}
+function paint() {
+  for (const pane of panes) if (pane !== shown) draw(pane);
+  draw(shown);
+}
+function draw(pane) {
+  const { canvas, context, events } = pane;
+  if (!has(pane)) { context.setTransform(1, 0, 0, 1, 0, 0); context.clearRect(0, 0, canvas.width, canvas.height); return; }
+  aim(pane);
+  pane.scene.draw(context, camera, pane === shown ? view : { ...view, events, branch: null });
 }
 function legend(r) {
   const rows = Array.from(new Set([r.ego, ...r.agents])).filter(row => r.rank.has(row));
@@ -104,11 +157,13 @@ function legend(r) {
   if (r["lights.x"].length) for (const [name, text] of [["stop", "■"], ["caution", "◆"], ["go", "●"]]) entries.push(sign(text, LIGHT_COLORS[name], `light: ${name}`));
   if (kinds.includes(MARKS.sign)) entries.push(sign("○", STOP, "stop sign"));
   if (kinds.includes(MARKS.crosswalk)) entries.push(sign("▭", "#9a958c", "crosswalk"));
+  const all = panes.filter(pane => pane.scene).map(pane => pane.scene.replay), happens = kind => all.some(one => one.events.some(e => e.kind === kind));
+  if (all.some(one => one["plan.count"])) entries.push(sign("⋯", PLAN, "plan"));
   if (r.lines("routes")) entries.push(sign("◎", INK, "end of a route, the goal"));
-  if (r.events.some(e => e.kind === "collision")) entries.push(sign("×", STOP, "collision"));
-  if (r.events.some(e => e.kind === "offroad")) entries.push(sign("△", EVENT_COLORS.offroad, "off the road"));
-  if (r.events.some(e => e.kind === "redlight")) entries.push(sign("△", STOP, "red light run"));
-  if (r.events.some(e => e.kind === "blocking")) entries.push(sign("△", EVENT_COLORS.blocking, "blocks traffic"));
+  if (happens("collision")) entries.push(sign("×", STOP, "collision"));
+  if (happens("offroad")) entries.push(sign("△", EVENT_COLORS.offroad, "off the road"));
+  if (happens("redlight")) entries.push(sign("△", STOP, "red light run"));
+  if (happens("blocking")) entries.push(sign("△", EVENT_COLORS.blocking, "blocks traffic"));
   $("legend").innerHTML = entries.join("");
 }
 
@@ -117,11 +172,11 @@ function whoPanel() {
   if (row === null) { $("who").innerHTML = `<h2>Agent</h2><p class="hint">Click an agent, or use Tab.</p>`; return; }
   const color = r.rank.has(row) ? r.color(row) : PLAYBACK;
   const facts = describeAgent(r, view).map(([a, b]) => `<dt>${a}</dt><dd>${escapeText(b)}</dd>`).join("");
-  if (!$("chart") || $("chart").dataset.row !== String(row)) {
-    $("who").innerHTML = `<h2>Agent</h2><div><b class="swatch" style="background:${color}"></b><strong>${escapeText(r.ids[row])}</strong></div><dl></dl><canvas id="chart" data-row="${row}"></canvas>`;
+  const held = $("who").querySelector("dl");
+  if (!held || held.dataset.row !== String(row)) {
+    $("who").innerHTML = `<h2>Agent</h2><div><b class="swatch" style="background:${color}"></b><strong>${escapeText(r.ids[row])}</strong></div><dl data-row="${row}"></dl>`;
   }
   $("who").querySelector("dl").innerHTML = facts;
-  speedChart($("chart"), r, view);
 }
 
 function scaleBar() {
@@ -139,15 +194,15 @@ function frame(now) {
     }
     if (dirty) {
       dirty = false;
-      const state = view.follow === null ? null : scene.replay.state(view.rollout, view.follow, view.t);
-      if (state) { camera.x = state.x; camera.y = state.y; }
-      scene.draw(context, camera, view);
+      paint();
       $("time").value = view.t;
       const r = scene.replay;
       $("clock").textContent = `${(view.t * r.dt).toFixed(1)} / ${(r.steps * r.dt).toFixed(1)} s`;
       $("follow").value = view.follow === null ? "" : view.follow;
       document.querySelectorAll("#events li[data-event]").forEach(li => li.classList.toggle("now", Math.abs(view.events[li.dataset.event].step - view.t) * r.dt < 0.5));
       whoPanel(); scaleBar();
+      const row = view.agent === null ? r.ego : view.agent, alone = panes.length === 1 && r.color(row);
+      drawMetrics($("metrics"), panes.filter(has).map(pane => ({ replay: pane.scene.replay, rollout: view.rollout, color: alone || pane.color, events: pane.events })), row, view.t);
       if (search) search.draw(view);
     }
   }
@@ -157,9 +212,8 @@ function frame(now) {
 // Mouse and touch: drag, wheel, two fingers, click.
 const pointers = new Map();
 let moved = 0;
-const place = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
-canvas.addEventListener("pointerdown", event => { canvas.setPointerCapture(event.pointerId); pointers.set(event.pointerId, place(event)); moved = 0; canvas.classList.add("dragging"); });
-canvas.addEventListener("pointermove", event => {
+const place = event => { const box = event.currentTarget.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+function move(event) {
   const before = pointers.get(event.pointerId);
   if (!before) return;
   const now = place(event), other = [...pointers].find(([id]) => id !== event.pointerId);
@@ -168,18 +222,29 @@ canvas.addEventListener("pointermove", event => {
   moved += Math.hypot(now[0] - before[0], now[1] - before[1]);
   if (moved > 4) view.follow = null;
   pointers.set(event.pointerId, now); dirty = true;
-});
-const release = event => {
-  if (pointers.delete(event.pointerId) && event.type === "pointerup" && moved < 4) select(scene.pick(view, ...camera.toWorld(...place(event))));
-  canvas.classList.remove("dragging");
-};
-canvas.addEventListener("pointerup", release);
-canvas.addEventListener("pointercancel", release);
-canvas.addEventListener("wheel", event => {
-  event.preventDefault();
-  const at = view.follow === null ? place(event) : [camera.width / 2, camera.height / 2];
-  camera.zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), ...at); dirty = true;
-}, { passive: false });
+}
+function pick(pane, event) {
+  if (!has(pane)) return;
+  if (pane !== shown) { show(pane); choose(view.rollout); }
+  aim(pane);
+  select(scene.pick(view, ...camera.toWorld(...place(event))));
+}
+for (const pane of panes) {
+  const { canvas } = pane, release = event => {
+    if (pointers.delete(event.pointerId) && event.type === "pointerup" && moved < 4) pick(pane, event);
+    canvas.classList.remove("dragging");
+  };
+  canvas.addEventListener("pointerdown", event => { canvas.setPointerCapture(event.pointerId); pointers.set(event.pointerId, place(event)); moved = 0; canvas.classList.add("dragging"); });
+  canvas.addEventListener("pointermove", move);
+  canvas.addEventListener("pointerup", release);
+  canvas.addEventListener("pointercancel", release);
+  canvas.addEventListener("wheel", event => {
+    event.preventDefault();
+    const at = view.follow === null ? place(event) : [camera.width / 2, camera.height / 2];
+    camera.zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), ...at); dirty = true;
+  }, { passive: false });
+}
+$("metrics").onclick = event => { play(false); seek(Math.round(metricsLayout($("metrics"), scene.replay).time(event.offsetX))); remember(); };
 const zoomBy = factor => { camera.zoom(factor, camera.width / 2, camera.height / 2); dirty = true; };
 $("closer").onclick = () => zoomBy(1.4); $("wider").onclick = () => zoomBy(1 / 1.4); $("fit").onclick = () => { view.follow = null; fit(); };
 
@@ -196,8 +261,11 @@ function follow(row) {
 }
 $("follow").onchange = event => { const row = event.target.value === "" ? -1 : +event.target.value; follow(row); if (row >= 0) select(row); };
 $("segment").onchange = event => open(+event.target.value).catch(complain);
-const neighbour = d => open((view.segment + d + about.segments.length) % about.segments.length).catch(complain);
+const neighbour = d => { const all = listed, i = all.indexOf(view.segment); open(all[(i + d + all.length) % all.length]).catch(complain); };
 $("previous").onclick = () => neighbour(-1); $("following").onclick = () => neighbour(1);
+let listed = [];
+$("filter").innerHTML = Object.entries(FILTERS).filter(([kind]) => !kind || about.segments.some(one => one.kinds.some(of => of && of.some(found => found.includes(kind))))).map(([kind, text]) => `<option value="${kind}">${text}</option>`).join("");
+$("filter").onchange = event => { view.filter = event.target.value; listed = listSegments(); open(listed.includes(view.segment) ? view.segment : listed[0], { rollout: view.rollout }).catch(complain); };
 $("rollout").onchange = event => choose(+event.target.value);
 $("events").onclick = event => { const li = event.target.closest("[data-event]"); if (li) jump(+li.dataset.event); };
 $("events").onkeydown = event => { if (event.key === "Enter") event.target.click(); };
@@ -223,18 +291,19 @@ const KEYS = { " ": () => play(!view.playing), ArrowRight: () => stepBy(1), Arro
   n: () => jump(view.events.findIndex(e => e.step > view.t + 1e-6)), p: () => jump(view.events.findLastIndex(e => e.step < view.t - 1e-6)) };
 document.addEventListener("keydown", event => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT" || !scene) return;
-  if (event.key === "Tab" && event.target === canvas) { event.preventDefault(); tab(event.shiftKey ? -1 : 1); return; }
+  if (event.key === "Tab" && event.target === shown.canvas) { event.preventDefault(); tab(event.shiftKey ? -1 : 1); return; }
   if (event.target.tagName === "BUTTON" && event.key === " ") return;
   if (event.target.type === "range" && event.key.startsWith("Arrow")) event.preventDefault();
   const action = KEYS[event.key];
   if (action) { action(); event.preventDefault(); }
 });
-new ResizeObserver(() => resize()).observe(canvas);
+new ResizeObserver(() => { resize(); if (scene) paint(); }).observe($("panes"));  // a canvas of another size is empty
 
 function complain(error) { $("message").hidden = false; $("message").textContent = `This page can't be shown: ${error.message || error}`; }
 function fromPlace() {
-  const wanted = new URLSearchParams(location.hash.slice(1)), found = about.segments.indexOf(wanted.get("segment"));
+  const wanted = new URLSearchParams(location.hash.slice(1)), found = about.segments.findIndex(one => one.id === wanted.get("segment"));
   const segment = Math.max(found, 0);
+  if (!listed.includes(segment)) { view.filter = $("filter").value = ""; listed = listSegments(); }
   return open(segment, { rollout: +wanted.get("rollout") || 0 }).then(() => {
     seek((+wanted.get("t") || 0) / scene.replay.dt);
     const ids = scene.replay.ids, who = wanted.get("follow"), row = ids.indexOf(wanted.get("agent"));
@@ -242,9 +311,9 @@ function fromPlace() {
     follow(who === "ego" ? scene.replay.ego : ids.indexOf(who));
   });
 }
-document.title = `${about.agent}: rollouts`;
-$("agent").textContent = about.agent;
-$("segment").innerHTML = about.segments.map((name, i) => `<option value="${i}">${escapeText(name)}</option>`).join("");
+if (panes.length === 1) $("agent").textContent = about.names[0];
+else document.querySelector("aside").append($("legend"));
+listed = listSegments();
 window.addEventListener("hashchange", () => fromPlace().catch(complain));
 if (!about.segments.length) complain("it holds no rollouts");
 else fromPlace().then(() => { document.body.dataset.ready = "1"; }).catch(complain);

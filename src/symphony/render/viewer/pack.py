@@ -1,9 +1,9 @@
 """What a page holds of each run segment: arrays of small integers, deflated, in base64.
 
-A packed segment is the deflated (zlib) form of: the length of a header (4 bytes, little-endian), the header as JSON,
-the arrays one after the other. The header has ``facts`` and ``arrays``; of each array its ``name``, ``type``,
-``shape``, ``offset`` behind the header, the ``scale`` its integers are multiplied with, and whether they are
-differences along the last axis (``delta``).
+The log of a segment is a block, and so is what each planner made of it: the deflated (zlib) form of the length of a
+header (4 bytes, little-endian), the header as JSON, the arrays one after the other. The header has ``facts`` and
+``arrays``; of each array its ``name``, ``type``, ``shape``, ``offset`` behind the header, the ``scale`` its integers
+are multiplied with, and whether they are differences along the last axis (``delta``).
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.segment import LaneType, Polylines, RunSegment
+from symphony.data.segment import LaneType, Polylines
 from symphony.errors import DataError
 
 if TYPE_CHECKING:
@@ -30,31 +30,32 @@ DEFAULT_WIDTH, BIKE_WIDTH = 3.6, 1.6
 """Metres, for lanes whose width the source does not give."""
 MILLIMETRE, CENTIMETRE, ANGLE = 1e-3, 1e-2, 1e-4
 """What places (metres), sizes and speeds (metres, m/s) and headings (radians) are rounded to."""
+FAR = 10.2
+"""Seconds to a collision above which the page knows none."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something to be marked in a replay.
+    """Something to be marked in a replay."""
 
-    Attributes:
-        rollout: its number.
-        step: the state at which it happens, from 0.
-        agent: row of the log.
-        kind: ``collision``, ``offroad``, ``redlight`` or ``blocking``.
-        text: what happened, behind the agent's id (of a collision: its kind).
-        other: row of the other agent of a collision, else -1.
-        fault: of a collision, whether the agent is at fault; None where that is not known.
-        label: short, for a list of rollouts.
-    """
+    rollout: int  # its number
+    step: int  # the state at which it happens, from 0
+    agent: int  # row of the log
+    kind: str  # `collision`, `offroad`, `redlight` or `blocking`
+    text: str  # what happened, behind the agent's id (of a collision: its kind)
+    other: int = -1  # row of the other agent of a collision
+    fault: bool | None = None  # of a collision, whether the agent is at fault, where that is known
+    label: str = ""  # short, for a list of rollouts
 
-    rollout: int
-    step: int
-    agent: int
-    kind: str
-    text: str
-    other: int = -1
-    fault: bool | None = None
-    label: str = ""
+
+class Replay(NamedTuple):
+    """What is shown of a run segment."""
+
+    saved: SavedRollouts
+    events: Sequence[Event] = ()
+    collision_in: NDArray[Any] | None = (
+        None  # [K, T, N] seconds after each step; not finite where none is near
+    )
 
 
 class _Packer:
@@ -102,46 +103,46 @@ class _Packer:
         return base64.b64encode(zlib.compress(block, 9)).decode()
 
 
-def packed(saved: SavedRollouts, events: Sequence[Event] = ()) -> str:
-    """One run segment with its rollouts, as the page holds it.
-
-    Raises:
-        DataError: a number is too large for the page; names the segment and the array.
-    """
-    try:
-        return _packed(saved, events)
-    except DataError as error:
-        raise error.at(segment=saved.segment.segment_id) from None
-
-
-def _packed(saved: SavedRollouts, events: Sequence[Event]) -> str:
-    segment, packer = saved.segment, _Packer()
+def packed(replay: Replay) -> str:
+    """What was simulated of a run segment; a DataError names an array with a number too large for the page."""
+    saved, packer = replay.saved, _Packer()
     facts: dict[str, Any] = {
-        "id": segment.segment_id,
-        "source": segment.source,
-        "dt": float(segment.dt),
-        "ego": int(segment.ego),
-        "ids": [str(number) for number in segment.agent_id.tolist()],
         "rollouts": saved.rollouts,
-        "steps": saved.steps,
         "drivers": list(saved.drivers),
         "failed": {str(number): reason for number, reason in saved.failed.items()},
-        "events": [asdict(event) for event in events],
+        "events": [asdict(event) for event in replay.events],
     }
-    _pack_log(packer, segment, slice(saved.start, saved.last + 1))
     packer.add("agents", "i16", saved.agents)
     there = saved.there
     packer.states("sim", np.where(there[..., None], saved.state, 0).swapaxes(1, 2))
     packer.add("sim.valid", "u8", there.swapaxes(1, 2))
     packer.add("goal", "i16", saved.goal)
     packer.lines("routes", saved.routes)
-    _pack_road(packer, segment)
+    if replay.collision_in is not None:
+        seconds = np.nan_to_num(replay.collision_in, nan=FAR).clip(0, FAR)
+        packer.add("ttc", "u8", seconds.swapaxes(1, 2), FAR / 255)
+    if saved.plan is not None:
+        planned = np.isfinite(saved.plan).all(-1)
+        packer.add("plan.count", "u8", planned.sum(-1))
+        for axis, letter in enumerate("xy"):
+            place = np.where(planned, saved.plan[..., axis], 0)
+            packer.add(f"plan.{letter}", "i32", place, CENTIMETRE, delta=True)
     if saved.trees is not None:
         facts |= _pack_trees(packer, saved.trees)
     return packer.text(facts)
 
 
-def _pack_log(packer: _Packer, segment: RunSegment, within: slice) -> None:
+def packed_log(saved: SavedRollouts) -> str:
+    """What was logged of a run segment while it was simulated, its map and its lights; see :func:`packed`."""
+    segment, packer, within = saved.segment, _Packer(), slice(saved.start, saved.last + 1)
+    facts: dict[str, Any] = {
+        "id": segment.segment_id,
+        "source": segment.source,
+        "dt": float(segment.dt),
+        "ego": int(segment.ego),
+        "ids": [str(number) for number in segment.agent_id.tolist()],
+        "steps": saved.steps,
+    }
     heading, velocity = segment.heading[:, within], segment.velocity[:, within]
     speed = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
     place = segment.position[:, within, :2]
@@ -152,9 +153,6 @@ def _pack_log(packer: _Packer, segment: RunSegment, within: slice) -> None:
     for axis, letter in enumerate("xy"):
         packer.add(f"lights.{letter}", "i32", segment.signal_point[:, axis], MILLIMETRE)
     packer.add("lights.state", "u8", segment.signal_state[:, within])
-
-
-def _pack_road(packer: _Packer, segment: RunSegment) -> None:
     road = segment.road
     default = np.where(road.lane_type == LaneType.BIKE_LANE, BIKE_WIDTH, DEFAULT_WIDTH)
     packer.lines("lanes", road.lanes)
@@ -163,6 +161,7 @@ def _pack_road(packer: _Packer, segment: RunSegment) -> None:
     packer.lines("boundary", road.boundary)
     packer.lines("marks", road.marks)
     packer.add("marks.type", "u8", road.mark_type)
+    return packer.text(facts)
 
 
 def _pack_trees(packer: _Packer, trees: SavedTrees) -> dict[str, Any]:

@@ -6,44 +6,61 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from symphony.data.segment import content_hash
+from symphony.errors import DataError
 from symphony.files import finite
-from symphony.render.viewer.pack import Event, packed
-
-if TYPE_CHECKING:
-    from symphony.saved.rollouts import SavedRollouts
+from symphony.render.viewer.pack import Replay, packed, packed_log
 
 SCRIPTS = ("data.js", "map.js", "scene.js", "search.js", "panels.js", "main.js")
 
 
-def view_page(
-    agent: str,
-    found: Iterable[tuple[SavedRollouts, Sequence[Event]]],
-    settings: Mapping[str, Any] | None = None,
-) -> str:
+def view_page(names: Sequence[str], found: Iterable[Sequence[Replay | None]]) -> str:
     """One self-contained page that plays rollouts: canvas and plain JavaScript, nothing is loaded from elsewhere.
 
     ``#segment=ID&rollout=K&t=SECONDS&agent=ID`` behind its address names what it shows.
 
     Args:
-        agent: name of what is evaluated.
-        found: rollouts of each segment, and what is to be marked in them.
-        settings: of the simulation.
+        names: of those who are shown side by side.
+        found: for each segment what each of them made of it, None for nothing.
+
+    Raises:
+        DataError: they were simulated on different logs or steps, or a number is too large for the page.
     """
-    ids, blocks = [], []
-    for number, (saved, events) in enumerate(found):
-        ids.append(saved.segment.segment_id)
-        blocks.append(f'<script type="text/plain" id="segment-{number}">{packed(saved, events)}</script>')
-    about = {"agent": agent, "segments": ids, "settings": dict(settings or {})}
+    segments: list[dict[str, Any]] = []
+    blocks: list[str] = []
+    for number, replays in enumerate(found):
+        first = next(replay.saved for replay in replays if replay is not None)
+        log, name = (content_hash(first.segment), first.start, first.steps), first.segment.segment_id
+        try:
+            texts = {f"segment-{number}": packed_log(first)}
+            for place, one in enumerate(replays):
+                if one is None:
+                    continue
+                if (content_hash(one.saved.segment), one.saved.start, one.saved.steps) != log:
+                    raise DataError(f"{names[place]} was simulated on another log, or for other steps")
+                texts[f"segment-{number}-{place}"] = packed(one)
+        except DataError as error:
+            raise error.at(segment=name) from None
+        blocks += [f'<script type="text/plain" id="{id}">{text}</script>' for id, text in texts.items()]
+        segments.append({"id": name, "kinds": [None if one is None else _kinds(one) for one in replays]})
     parts = {
-        "/*TITLE*/": escape(f"{agent}: rollouts"),
+        "/*TITLE*/": escape(f"{', '.join(names)}: rollouts"),
         "/*STYLE*/": template("view.css"),
-        "/*ABOUT*/": script_json(about),
+        "/*ABOUT*/": script_json({"names": list(names), "segments": segments}),
         "/*SEGMENTS*/": "\n".join(blocks),
         "/*SCRIPT*/": "\n".join(template(name) for name in SCRIPTS),
     }
     return filled(template("view.html"), parts)
+
+
+def _kinds(replay: Replay) -> list[list[str]]:
+    """The kinds of events of each rollout, to choose rollouts by."""
+    found = [{"failed"} if k in replay.saved.failed else set[str]() for k in range(replay.saved.rollouts)]
+    for event in replay.events:
+        found[event.rollout] |= {event.kind} | ({"fault"} if event.fault else set())
+    return [sorted(kinds) for kinds in found]
 
 
 def template(name: str) -> str:

@@ -40,26 +40,49 @@ function routeText(r, k, row) {
   return `${length.toFixed(0)} m, ${way}`;
 }
 
-function speedChart(canvas, r, view) {
-  const w = canvas.clientWidth || 290, h = 84, ratio = window.devicePixelRatio || 1, c = canvas.getContext("2d");
-  canvas.width = w * ratio; canvas.height = h * ratio;
+// Below the map: what is measured of one agent over time, a line for each planner.
+const METRICS = [
+  ["speed, m/s", (r, k, row, t) => speedAt(r, k, row, t)],
+  ["acceleration, m/s²", (r, k, row, t) => t ? (speedAt(r, k, row, t) - speedAt(r, k, row, t - 1)) / r.dt : NaN],
+  ["time to collision, s", (r, k, row, t) => r.collisionIn(k, row, t)],
+  ["from the log, m", (r, k, row, t) => { const a = r.state(k, row, t), b = r.logged(row, t); return a && b ? Math.hypot(a.x - b.x, a.y - b.y) : NaN; }],
+];
+function speedAt(r, k, row, t) { const state = r.state(k, row, t); return state ? state.s : NaN; }
+const METRICS_HEIGHT = 104, LEFT = 34;
+
+function metricsLayout(canvas, r) {
+  const each = (canvas.clientWidth || 900) / METRICS.length;
+  return { each, x: (i, t) => i * each + LEFT + (each - LEFT - 10) * t / r.steps, time: px => (px % each - LEFT) / (each - LEFT - 10) * r.steps };
+}
+
+// `lines`: of each planner its replay, rollout, colour and events.
+function drawMetrics(canvas, lines, row, now) {
+  const r = lines[0].replay, ratio = window.devicePixelRatio || 1, h = METRICS_HEIGHT, c = canvas.getContext("2d"), { each, x } = metricsLayout(canvas, r);
+  canvas.width = each * METRICS.length * ratio; canvas.height = h * ratio;
   c.setTransform(ratio, 0, 0, ratio, 0, 0);
-  const row = view.agent, n = r.agents.length, driven = r.rank.has(row), own = [], log = [];
-  for (let t = 0; t < r.states; t++) { const a = r.logged(row, t); log.push(a ? a.s : NaN); const b = driven ? r.simulated(view.rollout, r.rank.get(row), t) : a; own.push(b ? b.s : NaN); }
-  const top = Math.max(5, ...own.filter(Number.isFinite), ...log.filter(Number.isFinite)) * 1.08, left = 30, bottom = h - 15;
-  const x = t => left + (w - left - 4) * t / (r.states - 1), y = v => bottom - (bottom - 5) * Math.max(v, 0) / top;
-  c.font = "11px system-ui, sans-serif"; c.fillStyle = "#5b616b"; c.strokeStyle = "#d9d6cf"; c.lineWidth = 1;
-  const step = top > 20 ? 10 : top > 8 ? 5 : 2;
-  for (let v = 0; v <= top; v += step) { c.beginPath(); c.moveTo(left, y(v)); c.lineTo(w - 4, y(v)); c.stroke(); c.textAlign = "right"; c.fillText(v, left - 5, y(v) + 4); }
-  c.textAlign = "left"; c.fillText("speed, m/s", left, h - 3); c.textAlign = "right"; c.fillText(`${((r.states - 1) * r.dt).toFixed(0)} s`, w - 4, h - 3);
-  const plot = (values, color, dash, width) => {
-    c.strokeStyle = color; c.setLineDash(dash); c.lineWidth = width; c.beginPath();
-    values.forEach((v, t) => Number.isFinite(v) ? (t && Number.isFinite(values[t - 1]) ? c.lineTo(x(t), y(v)) : c.moveTo(x(t), y(v))) : 0);
-    c.stroke(); c.setLineDash([]);
-  };
-  if (driven) plot(log, INK, [4, 3], 1);
-  plot(own, driven ? r.color(row) : "#5b616b", [], 1.8);
-  c.strokeStyle = "#2b2f3688"; c.beginPath(); c.moveTo(x(view.t), 4); c.lineTo(x(view.t), bottom); c.stroke();
+  c.font = "11px system-ui, sans-serif";
+  METRICS.forEach(([name, value], i) => {
+    const found = lines.map(line => Array.from({ length: r.states }, (_, t) => value(line.replay, line.rollout, row, t)));
+    const log = i === 0 ? Array.from({ length: r.states }, (_, t) => { const a = r.logged(row, t); return a ? a.s : NaN; }) : [];
+    const known = [...found.flat(), ...log].filter(Number.isFinite), low = Math.min(0, ...known), high = Math.max(low + 2, ...known);
+    const y = v => h - 8 - (h - 30) * (v - low) / (high - low), step = [0.5, 1, 2, 5, 10, 20, 50, 100].find(s => (high - low) / s <= 4) || 200;
+    c.fillStyle = "#5b616b"; c.textAlign = "left"; c.fillText(known.length ? name : `${name}: –`, i * each + LEFT, 12);
+    c.strokeStyle = "#d9d6cf"; c.lineWidth = 1; c.textAlign = "right";
+    for (let v = Math.ceil(low / step) * step; v <= high + 1e-9; v += step) {
+      c.beginPath(); c.moveTo(x(i, 0), y(v)); c.lineTo(x(i, r.steps), y(v)); c.stroke(); c.fillText(+v.toFixed(1), x(i, 0) - 5, y(v) + 4);
+    }
+    const plot = (values, color, dash, width) => {
+      c.strokeStyle = color; c.setLineDash(dash); c.lineWidth = width; c.beginPath();
+      values.forEach((v, t) => Number.isFinite(v) ? (t && Number.isFinite(values[t - 1]) ? c.lineTo(x(i, t), y(v)) : c.moveTo(x(i, t), y(v))) : 0);
+      c.stroke(); c.setLineDash([]);
+    };
+    plot(log, INK, [4, 3], 1);
+    found.forEach((values, k) => plot(values, lines[k].color, [], 1.8));
+    for (const line of lines) for (const event of line.events) if (event.agent === row) {
+      c.fillStyle = EVENT_COLORS[event.kind] || STOP; c.beginPath(); c.arc(x(i, event.step), 20, 3, 0, 7); c.fill();
+    }
+    c.strokeStyle = "#2b2f3688"; c.beginPath(); c.moveTo(x(i, now), 18); c.lineTo(x(i, now), h - 8); c.stroke();
+  });
 }
 
 function eventText(r, event) {

@@ -1,6 +1,7 @@
 // What moves: boxes, the ways they took, lights, events and branches of a search.
 const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#882255", "#332288", "#d9c400", "#ff80ff", "#9ade6b"];
 const PLAYBACK = "#a9aeb5", INK = "#2b2f36", DARK = { 2: "#7d8794", 3: "#8b9097" };
+const PLAN = "#b5179e";
 const LIGHTS = { 1: "stop", 4: "stop", 7: "stop", 2: "caution", 5: "caution", 8: "caution", 3: "go", 6: "go" };
 const LIGHT_COLORS = { stop: STOP, caution: "#e69f00", go: "#009e73" };
 
@@ -14,7 +15,7 @@ class Scene {
     const r = this.replay, ratio = camera.ratio;
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     this.px = 1 / camera.scale;
-    const { routes, rollouts, trails, log, lights } = view.layers, one = routes ? view.agent : null;
+    const { routes, rollouts, trails, log, lights, plan } = view.layers, one = routes ? view.agent : null;
     this.map.draw(context, camera, [view.rollout, one, routes, rollouts, trails, log].join(), onMap => {
       if (routes) this.routes(onMap, view);
       if (rollouts) this.waysOfOthers(onMap, view);
@@ -29,6 +30,7 @@ class Scene {
     for (let row = 0; row < r.size.length / 2; row++) {
       if (!r.rank.has(row)) this.box(context, row, r.logged(row, view.t), DARK[r.type[row]] || PLAYBACK, 1);
     }
+    if (plan) this.plan(context, view);
     r.agents.forEach((row, n) => this.box(context, row, r.simulated(view.rollout, n, view.t), this.colors[n], 1));
     if (view.branch) this.branch(context, view);
     this.selection(context, view);
@@ -104,6 +106,17 @@ class Scene {
       context.strokeStyle = this.colors[i];
       this.way(context, "sim", view.rollout * n + i, from, Math.floor(view.t) + 1);
     }
+  }
+
+  // What the ego's planner meant to do when it was last asked.
+  plan(context, view) {
+    const r = this.replay, t = Math.min(Math.floor(view.t), r.steps - 1), points = r.plan(view.rollout, t), ego = r.state(view.rollout, r.ego, t);
+    if (!points.length || !ego) return;
+    context.beginPath(); context.moveTo(ego.x, ego.y);
+    for (const [x, y] of points) context.lineTo(x, y);
+    for (const [color, width] of [["white", 4.5], [PLAN, 2]]) { context.strokeStyle = color; context.lineWidth = width * this.px; context.stroke(); }
+    context.fillStyle = PLAN;
+    for (const [x, y] of points) { context.beginPath(); context.arc(x, y, 2.6 * this.px, 0, 7); context.fill(); }
   }
 
   ways(context, view) {
