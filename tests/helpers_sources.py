@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
 
 from symphony.data.segment import RoadMap, RunSegment
-from symphony.data.sources import get_reader
+from symphony.data.sources import get_reader, tfrecord
 from symphony.data.sources import womd_pb2 as pb
 from symphony.errors import DataError
 from symphony.geometry import segments_of, signed_distance
@@ -173,3 +174,12 @@ def off_road(road: RoadMap, spots: NDArray[Any]) -> NDArray[np.float32]:
     where = torch.as_tensor(np.ascontiguousarray(spots), dtype=torch.float32)[None]
     known = torch.ones(start.shape[:2], dtype=torch.bool)
     return signed_distance(where, start, end, known, before, after)[0].numpy()
+
+
+def write_records(path: Path, payloads: Iterable[bytes]) -> None:
+    """A TFRecord file."""
+    with path.open("wb") as file:
+        for payload in payloads:
+            length = struct.pack("<Q", len(payload))
+            for part in (length, payload):
+                file.write(part + struct.pack("<I", tfrecord.masked_crc32c(part)))

@@ -27,6 +27,7 @@ from helpers_sources import (
     read_one,
     state,
     womd_scenario,
+    write_records,
 )
 from symphony.data import convert as converting
 from symphony.data.convert import convert
@@ -35,7 +36,7 @@ from symphony.data.sources import get_reader, readers, tfrecord, womd
 from symphony.data.sources.base import Item
 from symphony.data.sources.commonroad import NO_LANELET, NO_LIGHT, NO_OBSTACLE
 from symphony.data.sources.lines import drivable_rings
-from symphony.data.sources.tfrecord import masked_crc32c, write_records
+from symphony.data.sources.tfrecord import masked_crc32c
 from symphony.errors import DataError
 
 GOOD = commonroad(ROAD, driver(7), driver(8, x=20))

@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 
 from helpers_segments import crossing, hide, straight_road
-from helpers_sources import ROAD, commonroad, driver, womd_scenario
+from helpers_sources import ROAD, commonroad, driver, womd_scenario, write_records
 from symphony.data.conformance import Conformance, ConformanceError, check_reader, check_segments
 from symphony.data.segment import AgentType, Polylines, RunSegment
 from symphony.data.sources import get_reader
 from symphony.data.sources.base import Item, Reader
-from symphony.data.sources.tfrecord import write_records
 from symphony.errors import DataError
 
 needs_pyarrow = pytest.mark.skipif(

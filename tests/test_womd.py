@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers_sources import FAR, read_error, read_one, womd_scenario
+from helpers_sources import FAR, read_error, read_one, womd_scenario, write_records
 from symphony.data.odd import NO_LINE, NO_SIZE, WILD
 from symphony.data.segment import AgentType, LaneType, MarkType, RunSegment
 from symphony.data.sources import get_reader, readers
-from symphony.data.sources.tfrecord import write_records
 from symphony.data.sources.womd_pb2 import Scenario
 from symphony.errors import ConfigError
 

@@ -16,11 +16,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from helpers_sources import write_records
 from helpers_wosac import record_rollouts, womd_record
 from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import WosacSettings
-from symphony.data.sources.tfrecord import write_records
 from symphony.errors import DataError, SymphonyError
 from symphony.wosac import wosac_pb2 as pb
 from symphony.wosac.files import read_rollouts, score_files
@@ -73,7 +73,7 @@ def refused(capsys):
 
 def test_scores_of_scenarios(tmp_path, monkeypatch):
     many, out, again, ahead = written(tmp_path, *NAMES, "dddd"), tmp_path / "a.json", tmp_path / "b.json", []
-    more = ("--config", "2024", "--per-object", "--features", tmp_path / "features")
+    more = ("--config", "2024", "--per-object")
     assert run(*many, "--json", out, *more) == 0
     found = json.loads(out.read_text())
     assert (found["config"], found["scenario_count"]) == ("2024", 4)
@@ -86,10 +86,6 @@ def test_scores_of_scenarios(tmp_path, monkeypatch):
     # What a scenario scores does not depend on those before it: the first one comes again.
     assert first == last
     assert [part["object_id"] for part in first["objects"]] == [100, 102]
-    with np.load(tmp_path / "features" / "aaaa.npz") as arrays:
-        assert arrays["eval_object_id"].tolist() == [100, 102]
-        assert arrays["sim_linear_speed"].shape == (32, 2, 80)
-        np.testing.assert_allclose(arrays["log_linear_speed"][:, 5:70], [[10.0] * 65, [12.0] * 65], atol=0.05)
     # The folder of the scenario file, and a pattern, mean the same; so do two workers.
     for scenario, how in ((tmp_path, ()), (tmp_path / "*.tfrecord", ("--workers", "2"))):
         assert run(scenario, many[1], "--json", again, *more, *how) == 0

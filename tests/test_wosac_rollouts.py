@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from helpers_agents import small
 from helpers_segments import crossing, hide, straight_road
+from helpers_sources import write_records
 from helpers_store import fill
 from helpers_wosac import womd_record
 from symphony.agents import load_agent
@@ -21,7 +22,6 @@ from symphony.cli import main
 from symphony.config import EvaluateConfig, WosacSettings
 from symphony.data.resample import resample, wrap
 from symphony.data.segment import AgentType, SignalState, validate
-from symphony.data.sources.tfrecord import write_records
 from symphony.data.sources.womd import scenario_to_segment
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError, SymphonyError

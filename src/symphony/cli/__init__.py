@@ -43,9 +43,9 @@ GONE = {
     "table --format text": "`--format markdown`, as is the default, reads as text, too",
     "table --format latex": "`--format json` has the numbers, and pandoc turns Markdown into LaTeX",
     "table --columns": "`symphony evaluate RUN --data DIR --details` prints these numbers",
-    "train --agent.persona": "agents learn no driving styles any more",
-    "evaluate --persona": "agents have no driving styles to be told",
-    "simulate --persona": "agents have no driving styles to be told",
+    "train --agent.persona": "agents have no driving styles to be told",
+    **dict.fromkeys(("evaluate --persona", "simulate --persona"), "agents have no driving styles to be told"),
+    "wosac score --features": "`symphony.wosac.scorer.compute_features` gives them in Python",
     "simulate --agents": "the agent is named without an option: `symphony simulate RUN --data DIR --out SIM`",
 }
 """Commands and options that are gone, and what takes their place."""

@@ -37,7 +37,6 @@ class Score(shared.Command):
     config: Year = "2025"
     json: shared.Json = None
     per_object: bool = False  # Write the numbers of each scored object into the JSON, too.
-    features: shared.Folder = None  # Folder for the features of every object and step (SCENARIO_ID.npz).
     partial: bool = False  # Leave out scenarios without rollouts; otherwise each must have some.
     strict: Strict = False
     workers: shared.Workers = 1

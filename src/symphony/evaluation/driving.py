@@ -184,7 +184,6 @@ def blocking(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Bool
 
 
 def _long(flags: Bools, dt: float) -> Bools:
-    """Flags [M, U] that stay for :data:`SECONDS` at least."""
     least = math.ceil(SECONDS / dt - 1e-6) + 1
     if flags.shape[1] < least:
         return np.zeros_like(flags)
@@ -295,7 +294,6 @@ def _with_log(route: Reals, log: Reals, seen: Bools) -> Reals:
 
 
 def _length(path: Reals, valid: Bools) -> Reals:
-    """[...] of paths [..., U, 2]."""
     strides = np.linalg.norm(np.diff(path, axis=-2), axis=-1)
     return np.where(valid[..., 1:] & valid[..., :-1], strides, 0).sum(-1)
 

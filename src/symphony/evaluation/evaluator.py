@@ -176,7 +176,6 @@ class _BatchEvaluator:
         found: Simulation,
         logged_curvature: list[NDArray[np.float64]],
     ) -> None:
-        """Add the rollouts of some run segments to what was found."""
         rollouts, (log, log_valid) = found.rollouts, logged(scenes)
         segments = [self.dataset.segment(i) for i in items]
         names = [segment.segment_id for segment in segments]

@@ -116,7 +116,6 @@ def planners_text(records: Sequence[Record]) -> str:
 
 
 def _crowds(records: Sequence[Record]) -> dict[str, list[Record]]:
-    """Records by their crowd, the best score first, those without any last."""
     crowds: dict[str, list[Record]] = {name: [] for name in map(crowd_name, records)}
     for one in sorted(records, key=lambda one: (one["score"] is None, -(one["score"] or 0.0))):
         crowds[crowd_name(one)].append(one)

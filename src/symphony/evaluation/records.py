@@ -207,7 +207,6 @@ def find_runs(folders: Iterable[Path]) -> list[Path]:
 
 
 def _runs_below(folder: Path) -> list[Path]:
-    """The folder itself or the runs in it, links followed; what lies in a run is none."""
     if (folder / "config.json").is_file():
         return [folder]
     inner = sorted(each for each in folder.iterdir() if each.is_dir()) if folder.is_dir() else []

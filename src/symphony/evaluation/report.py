@@ -211,7 +211,6 @@ def _percent(flags: Array, whole: int) -> float | None:
 
 
 def _most(values: Array, sign: float = 1.0) -> float | None:
-    """The largest finite value, times a sign; None without any."""
     known = values[np.isfinite(values)]
     return sign * float(known.max()) + 0.0 if len(known) else None
 

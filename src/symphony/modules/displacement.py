@@ -16,6 +16,12 @@ from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram,
 from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, SceneNetwork, scene_module
 from symphony.modules.policy import NoiseSampler
 
+ACCELERATION, LATERAL = 4.0, 6.0
+"""Largest accelerations in m/s^2, along and across; the second bounds the ratio of left to forward at speed."""
+SLOPE, LEAST_SCALE = 0.3, 0.05
+"""Largest ratio of left to forward at low speed, and smallest standard deviation of the Gaussian numbers."""
+AXLE = 0.3  # distance from box centre to rear axle, as a share of the length
+
 
 class _Parameters(nn.Module):
     """From the head's numbers, states [..., N, 4], own features and mask to the parameters.
@@ -24,20 +30,9 @@ class _Parameters(nn.Module):
     Padded agents, whose states may be anything, count as standing.
     """
 
-    def __init__(
-        self,
-        cells: int,
-        dt: float,
-        size_scale: float,
-        min_scale: float,
-        slope: float,
-        lateral: float,
-        axle: float,
-    ) -> None:
+    def __init__(self, cells: int, dt: float, size_scale: float) -> None:
         super().__init__()
-        self.cells = cells
-        self.dt, self.size_scale, self.min_scale = dt, size_scale, min_scale
-        self.slope, self.lateral, self.axle = slope, lateral, axle
+        self.cells, self.dt, self.size_scale = cells, dt, size_scale
 
     def forward(
         self,
@@ -49,12 +44,12 @@ class _Parameters(nn.Module):
         speed = torch.where(valid, state[..., 3], 0.0).clamp_min(0.0)
         # On a curve of curvature k the centre moves at an angle whose sine is k times its distance to the rear
         # axle; k v^2 is the lateral acceleration.
-        arm = self.axle * self.size_scale * torch.where(valid, own[..., 1], 0.0)
-        fast = speed.square() * self.slope / (self.lateral * arm.clamp_min(0.1))
-        bounds = speed * self.dt, self.slope / (1.0 + fast.square()).sqrt()
+        arm = AXLE * self.size_scale * torch.where(valid, own[..., 1], 0.0)
+        fast = speed.square() * SLOPE / (LATERAL * arm.clamp_min(0.1))
+        bounds = speed * self.dt, SLOPE / (1.0 + fast.square()).sqrt()
         if self.cells:
             return head, *bounds
-        return head[..., :2], self.min_scale + positive(head[..., 2:], 1.0), *bounds
+        return head[..., :2], LEAST_SCALE + positive(head[..., 2:], 1.0), *bounds
 
 
 def displacement_policy(
@@ -66,11 +61,6 @@ def displacement_policy(
     cells: int = 0,
     dt: float,
     size_scale: float = 5.0,
-    max_acceleration: float = 4.0,
-    max_lateral: float = 6.0,
-    max_slope: float = 0.3,
-    min_scale: float = 0.05,
-    axle: float = 0.3,
     own_keys: Sequence[NestedKey] = (OWN,),
     valid_key: NestedKey = VALID,
     state_key: NestedKey = STATE,
@@ -93,11 +83,6 @@ def displacement_policy(
         cells: of the histogram, along and across; 0 for a Gaussian.
         dt: seconds per step.
         size_scale: metres of box length that the own feature counts as 1.
-        max_acceleration: m/s^2, forward and backward.
-        max_lateral: m/s^2; bounds the ratio of left to forward at speed.
-        max_slope: largest ratio of left to forward at low speed.
-        min_scale: smallest standard deviation of the Gaussian numbers.
-        axle: distance from box centre to rear axle, as a share of the length.
         own_keys: features of the agent itself, concatenated.
         valid_key: mask of the agents.
         state_key: `[..., N, 4]`, of which the speed is read.
@@ -107,11 +92,8 @@ def displacement_policy(
     """
     if cells and (cells < 3 or cells % 2 == 0):
         raise ValueError(f"cells must be odd and at least 3, or 0 for none, is {cells}")
-    bounds = {"dt": dt, "max_acceleration": max_acceleration, "max_lateral": max_lateral}
-    bounds |= {"max_slope": max_slope, "min_scale": min_scale}
-    for name, value in bounds.items():
-        if not value > 0.0:
-            raise ValueError(f"{name} must be positive, is {value}")
+    if not dt > 0.0:
+        raise ValueError(f"dt must be positive, is {dt}")
     encoding = encoder(own_features, [group.features for group in groups], hidden=hidden)
     network = SceneNetwork(encoding, cells**2 or 4, head=head)
     names = ("logits", "pace", "slope") if cells else ("loc", "scale", "pace", "slope")
@@ -120,7 +102,7 @@ def displacement_policy(
     return ProbabilisticTensorDictSequential(
         scene_module(network, groups, ("agents", "head"), own_keys=own_keys, valid_key=valid_key),
         TensorDictModule(
-            _Parameters(cells, dt, size_scale, min_scale, max_slope, max_lateral, axle),
+            _Parameters(cells, dt, size_scale),
             in_keys=[("agents", "head"), state_key, own_keys[0], valid_key],
             out_keys=parameters,
         ),
@@ -129,6 +111,6 @@ def displacement_policy(
             action_key,
             noise_key=noise_key,
             distribution_class=DisplacementHistogram if cells else BoundedDisplacement,
-            distribution_kwargs={"reach": max_acceleration * dt**2, **kind},
+            distribution_kwargs={"reach": ACCELERATION * dt**2, **kind},
         ),
     )

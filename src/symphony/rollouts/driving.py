@@ -222,7 +222,6 @@ def _ruled(
 def _check_given(
     agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given: Int[Tensor, "B N"] | None
 ) -> None:
-    """Refuse goals for agents that follow none."""
     if given is None or agent.goals is not None or agent.rule:
         return
     follows = scenes.background & (config.others == "idm")
@@ -293,7 +292,6 @@ def filled_lines(totals: Float[Tensor, "B K P"], threshold: float) -> Int[Tensor
 
 
 def _branches(part: Tensor, order: Tensor) -> Tensor:
-    """part [B, trees, S, ...] at the branches order [B, trees, K]."""
     return part.take_along_dim(order.reshape(*order.shape, *(1,) * (part.ndim - 3)), 2)
 
 

@@ -17,7 +17,6 @@ from symphony.wosac.records import logged_scenario, parse_scenario, read_scenari
 from symphony.wosac.scorer import (
     CHALLENGES,
     SimulatedRollouts,
-    WosacFeatures,
     check_scored,
     compute_features,
     mean_scores,
@@ -61,7 +60,6 @@ class ScoreFile:
 
     config: str
     per_object: bool
-    features: Path | None
     strict: bool
 
     def __call__(self, packed: Packed) -> dict[str, Any] | Skip:
@@ -84,8 +82,6 @@ class ScoreFile:
         except DataError as error:
             raise error.at(file=rollouts, segment=name) from None
         found = compute_features(scenario, made)
-        if self.features is not None:
-            _write_features(self.features / f"{name}.npz", found)
         objects = {"objects": object_scores(found, config)} if self.per_object else {}
         return {"scenario_id": name, **score_features(found, config), **objects}
 
@@ -98,7 +94,6 @@ def score_files(
     workers: int = 1,
     partial: bool = False,
     per_object: bool = False,
-    features: Path | None = None,
     strict: bool = False,
     progress: Callable[[int, int | None], None] = lambda done, total: None,
 ) -> tuple[dict[str, Any], list[Skip]]:
@@ -110,11 +105,10 @@ def score_files(
     Args:
         scenarios: WOMD scenario file, folder of them, or pattern.
         rollouts: ``.npz`` of the only scenario's rollouts, or a folder with ``SCENARIO_ID.npz`` for each.
+        partial: leave out scenarios without rollouts, instead of an error.
         config: year of the challenge.
         workers: processes.
-        partial: leave out scenarios without rollouts, instead of an error.
         per_object: with the scores of each object.
-        features: folder to write each scenario's features to, as ``SCENARIO_ID.npz``.
         strict: a scenario that can't be scored is an error.
         progress: called with the scenarios done and, where known, all there are.
 
@@ -125,12 +119,10 @@ def score_files(
     Raises:
         DataError: rollouts don't fit, or no scenario can be scored; names file, scenario, agent and field.
     """
-    if features is not None:
-        features.mkdir(parents=True, exist_ok=True)
     total = len(list(rollouts.glob("*.npz"))) if rollouts.is_dir() else 1
     results: list[dict[str, Any]] = []
     skipped: list[Skip] = []
-    work = ScoreFile(config, per_object, features, strict)
+    work = ScoreFile(config, per_object, strict)
     for result in ordered_map(work, _packed(scenarios, rollouts, partial), workers=workers):
         if isinstance(result, Skip):
             skipped.append(result)
@@ -147,16 +139,6 @@ def score_files(
         "scenarios": results,
         "left_out": [skip.to_json() for skip in skipped],
     }, skipped
-
-
-def _write_features(file: Path, features: WosacFeatures) -> None:
-    """Write features as arrays: ``eval_object_id`` [E], ``log_valid`` [E, 80], and each feature of the log
-    (``log_NAME``) and of the rollouts (``sim_NAME``, with a leading dimension of rollouts).
-    """
-    arrays: dict[str, Any] = {f"log_{name}": values.numpy() for name, values in features.log.items()}
-    arrays |= {f"sim_{name}": values.numpy() for name, values in features.simulated.items()}
-    arrays |= {"eval_object_id": features.object_id.numpy(), "eval_object_type": features.object_type.numpy()}
-    np.savez_compressed(file, log_valid=features.log_valid.numpy(), **arrays)
 
 
 def _packed(scenarios: Path, rollouts: Path, partial: bool) -> Iterator[Packed]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import google_crc32c
@@ -62,12 +62,3 @@ def read_records(path: Path) -> Iterator[bytes | DataError]:
             good = masked_crc32c(payload) == int.from_bytes(tail, "little")
             message = "damaged: the checksum of the payload is wrong"
             yield payload if good else DataError(message, file=path, field=where)
-
-
-def write_records(path: Path, payloads: Iterable[bytes]) -> None:
-    """Write a file that :func:`read_records` reads."""
-    with path.open("wb") as file:
-        for payload in payloads:
-            length = struct.pack("<Q", len(payload))
-            file.write(length + _CHECK.pack(masked_crc32c(length)))
-            file.write(payload + _CHECK.pack(masked_crc32c(payload)))
