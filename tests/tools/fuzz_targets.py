@@ -26,7 +26,7 @@ from helpers_interaction import public, taf, track, walker, with_area
 from helpers_saved import played, random_trees
 from helpers_scenarionet import write as scenarionet
 from helpers_segments import crossing, straight_road
-from helpers_sources import ROAD, commonroad, driver, obstacle, state, womd_scenario
+from helpers_sources import ROAD, commonroad, driver, obstacle, state, womd_scenario, write_records
 from helpers_wosac import record_rollouts, womd_record
 from symphony.agents.checkpoint import MANIFEST, checkpoints, load_checkpoint, save_checkpoint
 from symphony.agents.choice import Best
@@ -38,7 +38,7 @@ from symphony.data.segment import RunSegment, content_hash
 from symphony.data.selection import choices
 from symphony.data.sources import get_reader, womd_pb2
 from symphony.data.sources.base import UnexpectedError
-from symphony.data.sources.tfrecord import read_records, write_records
+from symphony.data.sources.tfrecord import read_records
 from symphony.data.store import SegmentStore
 from symphony.data.store_format import SEGMENTS
 from symphony.data.store_writer import StoreWriter
