@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,9 @@ import torch
 
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
+from symphony.agents import load_agent
+from symphony.agents.checkpoint import save_checkpoint
+from symphony.agents.choice import FOLDER as PRETRAINED
 from symphony.modules import mlp, pool_elements
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -110,3 +114,17 @@ def test_reinforcement_learning_is_recorded(program: Any, tmp_path: Path, monkey
         assert one != other
     record = learning.record(runs)
     assert [len(row) for row in record["rows"]] == [len(record["columns"])] * 4
+
+
+def test_an_average_is_the_mean_of_the_checkpoints(program: Any, tmp_path: Path) -> None:
+    run, agent = tmp_path / "run", load_agent("pretrained:bc_ts_h")
+    shutil.copytree(PRETRAINED / "bc_ts_h", run, ignore=shutil.ignore_patterns("checkpoints"))
+    before = {name: weights.clone() for name, weights in agent.policy.named_parameters()}
+    folders = []
+    for step in (1, 2):
+        for weights in agent.policy.parameters():
+            weights.data += step
+        folders.append(save_checkpoint(run / "checkpoints", step=step, modules=agent.modules))
+    program("average").average(run, tmp_path / "mean", folders)
+    for name, weights in load_agent(str(tmp_path / "mean")).policy.named_parameters():
+        torch.testing.assert_close(weights.data, before[name] + 2)
