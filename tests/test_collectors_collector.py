@@ -334,6 +334,19 @@ def test_collectors_and_objectives_stand_alone():
                 assert not private, (source.name, name)
 
 
+class Remembers(Policy):
+    """Each action is larger than the one before, by an entry that no start state has."""
+
+    in_keys = [*Policy.in_keys, "memory"]  # noqa: RUF012
+    out_keys = [*Policy.out_keys, "memory"]  # noqa: RUF012
+
+    def forward(self, tensordict):
+        memory = tensordict.get("memory", torch.zeros(*tensordict.shape, 1))
+        super().forward(tensordict)
+        tensordict.set(ACTION, tensordict.get(ACTION) + memory[..., None])
+        return tensordict.set("memory", memory + 1)
+
+
 @pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
 def test_a_compiled_search_is_the_search_and_compiled_once():
     torch.compiler.reset()
@@ -343,10 +356,11 @@ def test_a_compiled_search_is_the_search_and_compiled_once():
         graphs.append(graph)
         return graph.forward
 
-    plain = make(policy=Policy())
-    compiled = make(policy=Policy(), compile_step={"backend": backend})
-    for collector in (plain, compiled):
-        collector.set_seed(3)
-    for _ in range(2):
-        assert_same(compiled.next(), plain.next())
-    assert len(graphs) == 1
+    for policy, programs in ((Policy(), 1), (Remembers(), 2)):
+        graphs.clear()
+        plain, compiled = make(policy=policy), make(policy=policy, compile_step={"backend": backend})
+        for collector in (plain, compiled):
+            collector.set_seed(3)
+        for _ in range(2):
+            assert_same(compiled.next(), plain.next())
+        assert len(graphs) == programs  # the first step has no memory yet

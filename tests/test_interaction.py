@@ -79,6 +79,8 @@ def test_an_ego_may_enter_late_and_leave_early(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         segment.position[segment.ego, :, 0] + segment.origin[0], np.arange(30, 101), atol=1e-4
     )
+    alone = segments(public(tmp_path, [*track(9, steps=range(100)), *track(3, steps=range(140, 201))]))
+    assert [one.num_steps for one in alone] == [100, 61]
     short = public(tmp_path, [*track(3, steps=range(55, 120)), *parked])
     assert "no moving vehicle is observed at every step" in read_error("interaction", short).message
 

@@ -183,6 +183,7 @@ def test_a_command_that_failed_leaves_nothing_in_the_way(store: Path, run: Path,
 @pytest.mark.parametrize(("body", "reason"), [
     ("__import__('sys').exit()", "called sys.exit(None)"),
     ("(*seen.ego[:2], 2e5, 1.0)", "a heading of 200000 rad"), ("missing", "missing"),
+    ("[seen.ego[:4], (1e6, 0, 0, 0)]", "a trajectory past 100000 m"),
 ])  # fmt: skip
 def test_what_a_planner_does_wrong_ends_its_run_only(store: Path, told: Any, body: str, reason: str) -> None:
     Path("mine.py").write_text(PLAN.format(body))

@@ -165,14 +165,17 @@ def beam_search(
     check_branching(env, start)
     whole = branched_env(env, start.shape)
     one_step = _compiled(whole, compile_step) if compile_step else _step
-    simulation = Simulation(
-        env, whole, start.shape, policy, score, aggregate, keep, until_done, one_step, start
-    )
+    # What a policy only writes is made anew at each step; all else, such as its memory, is carried on.
+    written = [key for key in getattr(policy, "out_keys", ()) if key not in getattr(policy, "in_keys", ())]
+    how = start.shape, policy, score, aggregate, keep, until_done, one_step, start, written
+    simulation = Simulation(env, whole, *how)
     ended = _ended(env, start, start.ndim)
     with set_exploration_type(exploration_type), branched_specs(policy, start.shape[:-1], start.shape):
         if isinstance(rule, Backtrack):
-            if leaves not in (None, branches):
-                raise ValueError("rule Backtrack gives all branches as leaves")
+            if leaves not in (None, branches) or compile_step:
+                raise ValueError(
+                    "rule Backtrack gives all branches as leaves, and its steps are not compiled"
+                )
             lines = follow(simulation.run, simulation.total, start, ended, rule, steps, prune_every)
             return _independent(lines, prune_every, keep_tree)
         periods = [min(prune_every, steps - first) for first in range(0, steps, prune_every)]
@@ -257,6 +260,7 @@ class Simulation:
     until_done: bool
     step: Callable[..., tuple[TensorDictBase, TensorDictBase, Tensor, Tensor]]
     start: TensorDictBase
+    written: Sequence[NestedKey]
 
     def run(self, now: TensorDictBase, ended: Bool[Tensor, "*b S K"], length: int) -> Run:
         """A period of some steps."""
@@ -265,7 +269,7 @@ class Simulation:
         # Policy and environment write into the TensorDict they are given.
         now, records, scores, ends = now.copy(), [], [], [ended]
         for _ in range(length):
-            now = now if self.step is _step else _ordered(now, self.start)
+            now = now if self.step is _step else _ordered(now.exclude(*self.written), self.start)
             kept, now, worth, end = self.step(env, self.policy, self.score, self.keep, now)
             records.append(kept)
             scores.append(worth)
@@ -314,12 +318,12 @@ def _compiled(env: EnvBase, how: bool | Mapping[str, Any]) -> Callable[..., Any]
 
 
 def _ordered(state: TensorDictBase, like: TensorDictBase) -> TensorDictBase:
-    """The entries that the first state has, in its order and no views: anything else would be compiled anew."""
+    """The entries in the order of the first state and no views: anything else would be compiled anew."""
     entries = {}
-    for key, first in like.items():
+    for key in sorted(state.keys(), key=[*like.keys(), *state.keys()].index):
         value = state.get(key)
-        if isinstance(first, TensorDictBase):
-            value = _ordered(value, first)
+        if isinstance(value, TensorDictBase):
+            value = _ordered(value, like.get(key, value))
         elif value._is_view():
             value = value.clone(memory_format=torch.contiguous_format)
         entries[key] = value

@@ -202,7 +202,6 @@ class SceneDataset:
         return self._graph(int(self.store.map_index[self.indices[i]]))
 
     def _scene(self, i: int) -> SceneBatch:
-        """Item ``i`` as a batch of one scene."""
         graph, segment = self.graph(i) if self.routes else None, self.segment(i)
         return scene(segment, self.interactive, graph, number=i)
 
@@ -380,6 +379,7 @@ def transitions(
     rows = {keys.SCENE: row, keys.STEP: step, keys.STREAM: scenes.stream[row]}
     each = {keys.GOAL: route[row], keys.STATE: fit.state[:, :-1], keys.VALID: fit.valid[:, :-1]}
     each |= {key: value[..., None] for key, value in rows.items()} | {keys.PROGRESS: fit.progress[:, :-1]}
+    env._followed = data.routes  # even where none of the agents is on a lane
     found = env.step(env.at(TensorDict(each, batch_size=row.shape)).set(keys.ACTION, fit.action))
     for part in (found, found.get("next")):
         part.set(keys.VALID, fit.known)

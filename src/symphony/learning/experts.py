@@ -114,7 +114,6 @@ def fit_experts(
 
 
 def _demonstrators(segment: RunSegment, graph: LaneGraph) -> NDArray[np.int64]:
-    """Rows of the agents to learn from."""
     valid = segment.valid
     at = np.arange(segment.num_agents), valid.argmax(1)
     lane = lane_of(graph, segment.position[at][:, :2], segment.heading[at], tolerance=IN_LANE)

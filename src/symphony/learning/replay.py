@@ -165,7 +165,6 @@ def search_statistics(env: DrivingEnv, leaves: TensorDictBase) -> TensorDict:
 
 
 def _after(steps: TensorDictBase) -> TensorDictBase:
-    """The states that steps led to."""
     after = {keys.STEP: steps.get(keys.STEP) + 1}
     after |= {key: steps.get(("next", *key)) for key in (keys.STATE, keys.PROGRESS)}
     kept = steps.select(keys.SCENE, keys.STREAM, keys.VALID, keys.GOAL)

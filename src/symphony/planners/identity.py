@@ -107,7 +107,6 @@ def _short(data: bytes) -> str:
 
 
 def _digest(file: str) -> str:
-    """A digest of what a file holds; empty where there is none that can be read."""
     try:
         return _short(Path(file).read_bytes())
     except OSError:

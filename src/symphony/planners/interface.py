@@ -36,6 +36,7 @@ MAX_SPEED = 80.0
 """m/s that a pose may ask for, and by which it may lie away from where the vehicle is."""
 MAX_HEADING = 1e4
 """Radians either way that a pose may have."""
+FARTHEST = 1e5  # metres from the origin that a trajectory may come to, as saved rollouts may
 
 
 class Pose(NamedTuple):
@@ -247,7 +248,6 @@ def planner_name(planner: str | Callable[..., Any]) -> str:
 
 
 def _needed(function: Callable[..., Any]) -> list[str]:
-    """Arguments by position that a function can't do without."""
     by_place = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     try:
         found = inspect.signature(function).parameters.values()
@@ -323,9 +323,10 @@ def checked_plan(plan: Any, state: NDArray[Any], dt: float) -> Reals:
     target: Reals = numbers[0] if trajectory else numbers
     away = math.dist(target[:2], state[:2])
     if max(away / dt, abs(target[3])) > MAX_SPEED:
-        raise ValueError(
-            f"a target {away:.1f} m away at {target[3]:.1f} m/s, at most {MAX_SPEED:g} m/s are possible"
-        )
+        why = f"a target {away:.1f} m away at {target[3]:.1f} m/s"
+        raise ValueError(f"{why}, at most {MAX_SPEED:g} m/s are possible")
+    if trajectory and np.abs(numbers[:, :2]).max() > FARTHEST:
+        raise ValueError(f"a trajectory past {FARTHEST:g} m from the origin")
     if abs(target[2]) > MAX_HEADING:
         raise ValueError(f"a heading of {target[2]:g} rad, at most {MAX_HEADING:g} are possible")
     return target

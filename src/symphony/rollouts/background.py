@@ -182,7 +182,6 @@ def _routes(scenes: SceneBatch, driver: included.IDMPlanner) -> _Lines:
 
 
 def _limits(scenes: SceneBatch, points: Tensor, unknown: float) -> Float[Tensor, "B N K"]:
-    """Speed limit of the lane nearest to each point."""
     lane = scenes.point_valid & (scenes.point_type == PointType.LANE)
     found = torch.full_like(points[..., 0], unknown)
     for b in range(len(scenes)):
@@ -278,7 +277,6 @@ def _project(
 
 
 def _at(line: _Lines, station: Float[Tensor, " P"]) -> Float[Tensor, "P 2"]:
-    """The points so many metres along."""
     piece = (torch.searchsorted(line.arc.contiguous(), station[:, None], right=True) - 1)[:, 0]
     piece, row = piece.clamp(0, line.arc.shape[-1] - 2), torch.arange(len(piece), device=piece.device)
     (start, end), (low, high) = ((part[row, piece], part[row, piece + 1]) for part in (line.points, line.arc))

@@ -46,7 +46,6 @@ _KEPT = (
 
 
 def _settings(env: DrivingEnv, rule: PruningRule | Backtrack, also: Sequence[Any] = ()) -> dict[str, Any]:
-    """Settings that every search of driving gives the collector."""
     waiting = [keys.WAITING] if env.open_traffic else []
     return {
         "aggregate": max_then_sum,

@@ -303,7 +303,6 @@ def read_tensors(data: bytes, file: Path, segment_id: str) -> SavedRollouts:
 
 
 def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedRollouts:
-    """Saved rollouts of arrays whose shapes are not checked yet."""
     if "log_weight" in arrays:
         raise DataError("is of a search with a tilt, which is no more: simulate anew", field="log_weight")
     kinds = {**_SCALARS, "start": int, "drivers": list, "failed": dict}

@@ -15,7 +15,7 @@ import torch
 
 from symphony.agents import Agent
 from symphony.config import EvaluateConfig
-from symphony.errors import DataError
+from symphony.errors import ConfigError, DataError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.planners.calls import SECONDS
 from symphony.planners.driver import ego_planners
@@ -57,6 +57,8 @@ def save_simulation(
         DataError: the folder holds something else, or the disk refuses.
         ConfigError: the agent can't be simulated so, or a goal can't be reached.
     """
+    if drives and not planner:
+        raise ConfigError("others can have a planner only beside one of the ego (`log` plays back its log)")
     planners: Planners = {None: planner, **(drives or {})} if planner else {}
     config = beside_planner(config) if planner else config
     settings = plain_settings(config, agent, dataset.interactive, dataset.duration)

@@ -208,7 +208,7 @@ def _observed(rows: Rows, begin: int, stop: int) -> tuple[int, int]:
                 np.linalg.norm(rows.state[part, :2] - rows.state[part[0], :2], axis=-1).max() > base.MOVING
             )
             best = times[step[part]] if moves and len(part) > len(best) else best
-    whole = len(best) == len(times) or not len(best) or 2 * (best[-1] - best[0]) < stop - begin - 1
+    whole = not len(best) or 2 * (best[-1] - best[0]) < stop - begin - 1
     return (begin, stop) if whole else (int(best[0]), int(best[-1]) + 1)
 
 
