@@ -317,7 +317,9 @@ def test_goal_batches_are_the_choices_of_the_environment(dataset: SceneDataset) 
 
 
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
-def test_fitted_states_are_those_of_the_experts_and_transitions_lead_through_them(store, dynamics):
+def test_fitted_states_are_those_of_the_experts_and_transitions_lead_through_them(
+    store, dynamics, monkeypatch
+):
     data, items = SceneDataset(SegmentStore(store), 2, dynamics, routes=True), [2, 0, 1]
     sees = ObservationConfig(num_objects=3, num_points=4, route=True)
     env, fit = DrivingEnv(data.scenes(items), dynamics, sees), data.fitted(items, data.scenes(items))
@@ -342,6 +344,9 @@ def test_fitted_states_are_those_of_the_experts_and_transitions_lead_through_the
             fitted = fit.state[b, int(after[keys.STEP])]
             torch.testing.assert_close(after[keys.STATE][known], fitted[known], atol=1e-3, rtol=0)
             torch.testing.assert_close(after[keys.REWARD][known][:, 0], after[keys.STATE][known][:, 3])
+    (off := env.scenes.clone()).route_logged.fill_(-1)  # on no lane, which is not forgotten
+    monkeypatch.setattr(data, "scenes", lambda items: off)
+    assert len(transitions(data, items, sees)) == len(found)
 
 
 def test_one_search_serves_as_many_updates_as_configured(store, tmp_path, monkeypatch):

@@ -390,3 +390,5 @@ def test_planners_of_others_fail_by_their_name_and_what_can_not_be_is_told(store
         assert why in capsys.readouterr().err
     with pytest.raises(ConfigError, match="agent 7, which has a planner, is not driven"):
         run(store, tmp_path / "x", "log", drives={7: "log"})
+    with pytest.raises(ConfigError, match="only beside one of the ego"):
+        run(store, tmp_path / "x", "", drives={7: "log"})
