@@ -16,7 +16,7 @@ import pytest
 
 from symphony.data.convert import convert
 from symphony.data.sources import womd_pb2 as pb
-from symphony.data.sources.tfrecord import masked_crc32c, read_records
+from symphony.data.sources.womd import masked_crc32c, read_records
 
 RECORDS = 20
 

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, settings
 from numpy.typing import NDArray
 
 from symphony.data.segment import RoadMap, RunSegment
-from symphony.data.sources import get_reader, tfrecord
+from symphony.data.sources import get_reader, womd
 from symphony.data.sources import womd_pb2 as pb
 from symphony.errors import DataError
 from symphony.geometry import segments_of, signed_distance
@@ -182,4 +182,4 @@ def write_records(path: Path, payloads: Iterable[bytes]) -> None:
         for payload in payloads:
             length = struct.pack("<Q", len(payload))
             for part in (length, payload):
-                file.write(part + struct.pack("<I", tfrecord.masked_crc32c(part)))
+                file.write(part + struct.pack("<I", womd.masked_crc32c(part)))

@@ -32,11 +32,11 @@ from helpers_sources import (
 from symphony.data import convert as converting
 from symphony.data.convert import convert
 from symphony.data.segment import RunSegment, content_hash, validate
-from symphony.data.sources import get_reader, readers, tfrecord, womd
+from symphony.data.sources import get_reader, readers, womd
 from symphony.data.sources.base import Item
 from symphony.data.sources.commonroad import NO_LANELET, NO_LIGHT, NO_OBSTACLE
 from symphony.data.sources.lines import drivable_rings
-from symphony.data.sources.tfrecord import masked_crc32c
+from symphony.data.sources.womd import masked_crc32c
 from symphony.errors import DataError
 
 GOOD = commonroad(ROAD, driver(7), driver(8, x=20))
@@ -243,7 +243,7 @@ def test_outlines_that_cross_without_end() -> None:
 
 def test_records_that_are_too_large_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     big, small = (womd_scenario(f"of-{n}", tracks=n).SerializeToString() for n in (9, 2))
-    monkeypatch.setattr(tfrecord, "MAX_RECORD", len(big) - 1)
+    monkeypatch.setattr(womd, "MAX_RECORD", len(big) - 1)
     write_records(tmp_path / "a", [big, small])
     error, item = get_reader("womd").read(tmp_path / "a")
     assert isinstance(error, DataError)
@@ -305,7 +305,7 @@ def test_a_segment_that_nothing_can_be_done_with_is_counted(tmp_path: Path, monk
         if segment.segment_id == "straight-1":
             raise ZeroDivisionError("of paths")
 
-    monkeypatch.setattr("symphony.data.parts.exclusion", fails)
+    monkeypatch.setattr("symphony.data.convert.exclusion", fails)
     (tmp_path / "a.scene").write_text("straight 1\nstraight 2")
     report = convert(FakeReader(), [tmp_path / "a.scene"], tmp_path / "out")
     assert (report.converted, report.skipped[0].segment) == (1, "straight-1")

@@ -27,7 +27,8 @@ from helpers_processes import apart
 from helpers_segments import crossing
 from helpers_sources import off_road
 from symphony import parallel as engine
-from symphony.data import parts, store_format, store_writer
+from symphony.data import convert as conversion
+from symphony.data import store_format, store_writer
 from symphony.data.builtin import builtin_store
 from symphony.data.convert import Report, convert, expand, info, merge
 from symphony.data.odd import crop
@@ -329,7 +330,7 @@ def snapshots(folder: Path, action: Callable[[], Any]) -> list[Path]:
 
 
 def test_killed_at_any_change(paths: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "PART_FILES", 2)
+    monkeypatch.setattr(conversion, "PART_FILES", 2)
     home = tmp_path / "home"
     home.mkdir()
 
@@ -350,7 +351,7 @@ def test_killed_at_any_change(paths: list[Path], tmp_path: Path, monkeypatch: py
 def converted(folder: Path, workers: int, told: Connection) -> None:
     """Convert in a process that may be killed, and tell how it goes."""
     os.fsync = lambda descriptor: None
-    parts.PART_FILES = 3
+    conversion.PART_FILES = 3
     # Of all that this process holds, workers need little.
     preload = multiprocessing.get_context("forkserver").set_forkserver_preload
     engine.get_ready = lambda _: preload([convert.__module__, FakeReader.__module__])
@@ -389,7 +390,7 @@ def test_kill_9_at_random_moments(tmp_path: Path) -> None:
 
 
 def test_finished_files_stay(paths: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "PART_FILES", 1)
+    monkeypatch.setattr(conversion, "PART_FILES", 1)
     paths[3].write_text("crossing 3\ninterrupt\nstraight 4")
     with pytest.raises(KeyboardInterrupt):
         convert(FakeReader(), paths, tmp_path / "store")
@@ -407,7 +408,7 @@ def test_finished_files_stay(paths: list[Path], tmp_path: Path, monkeypatch: pyt
 
 
 def test_workers_change_nothing(paths: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "PART_FILES", 1)
+    monkeypatch.setattr(conversion, "PART_FILES", 1)
     told: dict[int, list[tuple[int, int, int]]] = {1: [], 3: []}
     for workers, heard in told.items():
 
@@ -429,7 +430,7 @@ class Deadly(FakeReader):
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 def test_a_worker_dies(paths: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "PART_FILES", 1)
+    monkeypatch.setattr(conversion, "PART_FILES", 1)
     with pytest.raises(SymphonyError, match="a worker process ended"):
         convert(Deadly(), paths, tmp_path / "store", workers=2)
     assert (tmp_path / "store.partial").is_dir()

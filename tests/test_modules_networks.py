@@ -11,7 +11,7 @@ from tensordict.nn import InteractionType, set_interaction_type
 from torch import nn
 
 from symphony import keys, modules
-from symphony.modules.goals import NO_ROUTE
+from symphony.modules.policy import NO_ROUTE
 from symphony.objectives import GoalLoss
 from symphony.streams import uniform
 

@@ -32,18 +32,10 @@ from symphony.data.segment import MarkType, Polylines, RunSegment
 from symphony.errors import ConfigError
 from symphony.evaluation import records as records_module
 from symphony.render import Clip, animate_rollouts, plot_curves, plot_grid, plot_rollout, plot_segment, viewer
-from symphony.render.agents import CORNERS, NOSE, pieces, place
 from symphony.render.curves import read_curves, smoothed
 from symphony.render.plots import colors_of
-from symphony.render.roads import SIGNALS, lane_arrows, road_ribbon
-from symphony.render.style import (
-    AGENT_COLORS,
-    INK,
-    PLAYBACK,
-    ROAD,
-    new_figure,
-    view_around,
-)
+from symphony.render.roads import CORNERS, NOSE, SIGNALS, lane_arrows, pieces, place, road_ribbon
+from symphony.render.style import AGENT_COLORS, INK, PLAYBACK, ROAD, new_figure, view_around
 from symphony.render.video import frames_of
 
 

@@ -27,18 +27,29 @@ from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation.table import WOSAC, Entry, compare
 from symphony.rollouts.driving import simulation
-from symphony.wosac.bystanders import AHEAD, COURSE, PACE, standing, walks
-from symphony.wosac.evaluate import evaluate_wosac, simulated_how
-from symphony.wosac.passing import order_of, passing_gaps, passing_pairs
+from symphony.wosac.evaluate import (
+    evaluate_wosac,
+    log_playback,
+    order_of,
+    passing_gaps,
+    passing_pairs,
+    simulated_how,
+    wosac_scenario,
+    wosac_window,
+)
 from symphony.wosac.records import logged_scenario, parse_scenario, read_scenarios
 from symphony.wosac.scorer import SimulatedRollouts, compute_features, score
 from symphony.wosac.scorer.scenario import STATES
-from symphony.wosac.segments import log_playback, wosac_scenario, wosac_window
 from symphony.wosac.simulate import (
+    AHEAD,
+    COURSE,
+    PACE,
     between_decisions,
     constant_velocity,
     future_log,
     history_only,
+    standing,
+    walks,
     wosac_rollouts,
 )
 from symphony.wosac.submission import check_submission, required_agents

@@ -32,13 +32,12 @@ from symphony.agents.checkpoint import MANIFEST, checkpoints, load_checkpoint, s
 from symphony.agents.choice import Best
 from symphony.cli.rollouts import write_view
 from symphony.config import AgentSpec, DiscriminatorConfig, TrainConfig, read_json, to_json
-from symphony.data.convert import info
-from symphony.data.parts import Preparation
+from symphony.data.convert import Preparation, info
 from symphony.data.segment import RunSegment, content_hash
 from symphony.data.selection import choices
 from symphony.data.sources import get_reader, womd_pb2
 from symphony.data.sources.base import UnexpectedError
-from symphony.data.sources.tfrecord import read_records
+from symphony.data.sources.womd import read_records
 from symphony.data.store import SegmentStore
 from symphony.data.store_format import SEGMENTS
 from symphony.data.store_writer import StoreWriter

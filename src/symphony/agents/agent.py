@@ -4,27 +4,126 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
 from torch import nn
 
-from symphony.agents import networks
+from symphony import keys, modules
 from symphony.agents.checkpoint import CheckpointError, load_checkpoint
 from symphony.agents.choice import PREFIX, choose, split_name
-from symphony.agents.networks import dynamics_of, observation_of
-from symphony.config import AgentSpec, EvaluateConfig, SearchConfig, read_json
+from symphony.config import AgentConfig, AgentSpec, EvaluateConfig, SearchConfig, read_json
 from symphony.envs.dynamics import Bicycle, ConstantVelocity, Displacement, RandomActions
-from symphony.envs.observation import ObservationConfig
+from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
+from symphony.envs.routes import ALONG_FEATURES, CHOICE_FEATURES, ROUTE_FEATURES, TURN_FEATURES
 from symphony.errors import ConfigError, DataWarning
-from symphony.imports import load_object
+from symphony.imports import build_object, load_object
+from symphony.modules.encoder import FORESIGHT, ElementGroup, SceneEncoder
 
-PLAYBACK = "playback"
-"""Name of the logged trajectories themselves, evaluated like an agent."""
-FILE = "agent.json"
-"""File in a run's folder that holds the agent's specification."""
+RADIUS = 20.0  # metres around an agent that its discriminator observes
+
+
+def dynamics_of(spec: AgentSpec) -> Bicycle | Displacement:
+    """The action space: MGAIL needs one that its gradient can pass (paper, section V-A)."""
+    return Displacement() if spec.action_space == "displacement" else bicycle(spec.agent)
+
+
+def bicycle(config: AgentConfig) -> Bicycle:
+    """The discrete actions of an agent."""
+    return Bicycle(num_acceleration=config.accelerations)
+
+
+def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> ObservationConfig:
+    """What the networks observe: with the clearances that only the discriminator reads, or, as they cost, without."""
+    features = spec.discriminator.features if discriminator and spec.discriminator is not None else "paper"
+    gaps = spec.agent.features != "paper"
+    return ObservationConfig(
+        num_points=spec.agent.num_points,
+        num_lights=spec.agent.num_lights,
+        route=spec.goals,
+        turns=spec.goals and spec.agent.goal_features == "turns",
+        along=gaps and spec.goals,
+        gaps=gaps,
+        clearance=features != "paper",
+        foresight=FORESIGHT if gaps or features == "foresight" else (),
+    )
+
+
+def _groups(spec: AgentSpec, *, route: bool) -> tuple[ElementGroup, ...]:
+    """What a network sees around an agent, that follows a route or not."""
+    along, gaps = 0, 0
+    if spec.agent.features != "paper":
+        along, gaps = ALONG_FEATURES * (route and spec.goals), 3 * (1 + len(FORESIGHT))
+    more: dict[str, Any] = {"more_keys": (keys.ALONG,) if along else ()}
+    more["gap_keys"] = (keys.GAP, keys.GAP_AHEAD) if gaps else ()
+    objects = ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, OBJECT_FEATURES + along + gaps, **more)
+    points = ElementGroup(keys.POINTS, keys.POINTS_MASK, POINT_FEATURES)
+    lights = ElementGroup(keys.LIGHTS, keys.LIGHTS_MASK, POINT_FEATURES)
+    return (objects, points, lights) if spec.agent.num_lights else (objects, points)
+
+
+def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
+    """Actions from observations, and from the route that is the goal: a categorical over the joint actions of the
+    bicycle, or a Gaussian or a histogram over displacements. Seed torch beforehand.
+    """
+    if spec.agent.policy != "paper":
+        return build_object(spec.agent.policy, spec)
+    sizes: dict[str, Any] = {
+        "hidden": spec.agent.hidden,
+        "head": (2 * spec.agent.hidden, 2 * spec.agent.hidden),
+        "own_keys": _own_keys(spec),
+        "encoder": _encoder(spec),
+    }
+    own, dynamics, groups = _own_features(spec), dynamics_of(spec), _groups(spec, route=True)
+    if isinstance(dynamics, Bicycle):
+        return modules.discrete_policy(own, groups, actions=dynamics.num_actions, **sizes)
+    sizes |= {"size_scale": observation_of(spec).size_scale, "cells": spec.agent.cells}
+    return modules.displacement_policy(own, groups, dt=spec.dt, **sizes)
+
+
+def goal_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
+    """Routes from first states, by an encoder of its own (paper, section III-B)."""
+    features = CHOICE_FEATURES + TURN_FEATURES * (spec.agent.goal_features == "turns")
+    sizes: dict[str, Any] = {"hidden": spec.agent.hidden, "encoder": _encoder(spec)}
+    return modules.goal_policy(SELF_FEATURES, _groups(spec, route=False), features, **sizes)
+
+
+def discriminator_network(spec: AgentSpec) -> TensorDictModule:
+    """How simulated a state looks, given the goal."""
+    config = spec.discriminator
+    if config is None:
+        raise ValueError("the specification has no discriminator")
+    if config.network != "paper":
+        return build_object(config.network, spec)
+    return modules.discriminator(
+        _own_features(spec),
+        OBJECT_FEATURES,
+        POINT_FEATURES,
+        own_keys=_own_keys(spec),
+        radius=RADIUS / observation_of(spec).distance_scale,
+        hidden=config.hidden,
+        head=(2 * config.hidden,),
+        features=config.features,
+    )
+
+
+def _own_keys(spec: AgentSpec) -> tuple[keys.Key, ...]:
+    return (keys.OWN, keys.ROUTE) if spec.goals else (keys.OWN,)
+
+
+def _own_features(spec: AgentSpec) -> int:
+    return SELF_FEATURES + (ROUTE_FEATURES if spec.goals else 0)
+
+
+def _encoder(spec: AgentSpec) -> Any:
+    return SceneEncoder if spec.agent.encoder == "paper" else partial(build_object, spec.agent.encoder)
+
+
+PLAYBACK = "playback"  # name of the logged trajectories themselves, evaluated like an agent
+FILE = "agent.json"  # file in a run's folder that holds the agent's specification
 
 
 class SearchPlan(NamedTuple):
@@ -93,8 +192,7 @@ class Agent:
     def plan(self, config: EvaluateConfig) -> SearchPlan:
         """How the rollouts of a run segment come about.
 
-        Raises:
-            ConfigError: the search needs a discriminator and the agent has none, or trees are too small.
+        Raises a :class:`ConfigError` where the search needs a discriminator that it lacks, or trees are too small.
         """
         search = config.pruning(self.search)
         blind = search.score == "discriminator" and self.discriminator is None
@@ -131,8 +229,8 @@ class Agent:
 
 def build_agent(name: str, spec: AgentSpec) -> Agent:
     """An agent with fresh networks; seed torch beforehand."""
-    policy, goals = networks.policy_network(spec), networks.goal_network(spec) if spec.goals else None
-    discriminator = None if spec.discriminator is None else networks.discriminator_network(spec)
+    policy, goals = policy_network(spec), goal_network(spec) if spec.goals else None
+    discriminator = None if spec.discriminator is None else discriminator_network(spec)
     return Agent(name, policy, spec, goals, discriminator)
 
 

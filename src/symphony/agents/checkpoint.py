@@ -30,8 +30,7 @@ from symphony.errors import DataError
 
 FORMAT = 1
 MANIFEST = "checkpoint.json"
-TAG = "$"
-"""Key of a JSON object that stands for something JSON lacks."""
+TAG = "$"  # key of a JSON object that stands for something JSON lacks
 _NAME = re.compile(r"step-(\d{12})")
 
 
@@ -58,15 +57,11 @@ def save_checkpoint(
 
     The checkpoint appears complete or not at all; one of the same step is replaced. One process writes at a time.
 
-    Args:
-        folder: of all checkpoints of the run, made if absent.
-        step: updates done so far.
-        modules: by name, saved by their `state_dict`.
-        optimizers: by name, or whatever else keeps a state, such as a schedule of learning rates.
-        extra: JSON-like values (also tuples and tensors), handed back by :func:`load_checkpoint`.
+    The folder is that of all checkpoints of the run, and made if absent. Modules are saved by name, by their
+    `state_dict`, and so is whatever else keeps a state (optimizers, a schedule of learning rates); ``extra`` are
+    JSON-like values, also tuples and tensors, that :func:`load_checkpoint` hands back.
 
-    Raises:
-        CheckpointError: if something can't be stored or the disk refuses; earlier checkpoints stay as they are.
+    Raises a :class:`CheckpointError` if something can't be stored or the disk refuses; earlier ones stay as they are.
     """
     final = folder / f"step-{step:012d}"
     states: dict[str, Any] = {"rng": _rng_state(), "extra": dict(extra or {})}
@@ -104,16 +99,11 @@ def load_checkpoint(
 ) -> LoadedCheckpoint:
     """Restore what is passed from the checkpoint folder `path`; no module is changed unless all fit.
 
-    Args:
-        path: one checkpoint, as returned by :func:`save_checkpoint` or :func:`latest`.
-        modules: by the names they were saved under.
-        optimizers: by the names they were saved under.
-        partial: allow the checkpoint to hold more than is asked for (evaluation needs the policy only).
-        restore_rng: also set the global random states of Python, numpy and torch.
+    Modules and optimizers go by the names they were saved under; ``partial`` lets the checkpoint hold more than is
+    asked for. With ``restore_rng`` the global random states of Python, numpy and torch are set, too.
 
-    Raises:
-        CheckpointError: if the folder is no complete checkpoint of this format, a checksum fails, names, shapes or
-            types differ, or a weight is not finite; names the file and the field.
+    Raises a :class:`CheckpointError` if the folder is no complete checkpoint of this format, a checksum fails, names,
+    shapes or types differ, or a weight is not finite; names the file and the field.
     """
     manifest, file = _read_manifest(path), path / MANIFEST
     asked: dict[str, Any] = {f"module.{name}": item for name, item in (modules or {}).items()}

@@ -13,11 +13,9 @@ from typing import Any
 from symphony.agents.checkpoint import MANIFEST, CheckpointError, checkpoints, load_checkpoint
 from symphony.errors import ConfigError, DataError
 
-PREFIX = "pretrained:"
-"""Names of agents that come with the package begin with it."""
+PREFIX = "pretrained:"  # names of agents that come with the package begin with it
 FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
-CARD = "card.json"
-"""Model card in an agent's folder."""
+CARD = "card.json"  # model card in an agent's folder
 
 
 @dataclass(frozen=True)
@@ -64,14 +62,9 @@ def choose(folder: Path, which: str = "") -> Path:
 
     The last one knows which is the best, so that there is no second record to fall out of step with it.
 
-    Args:
-        folder: of the run.
-        which: ``best``, ``last``, or a step such as ``3000`` or ``step-3000``; by default the best if the run was
-            validated, else the last.
-
-    Raises:
-        ConfigError: if there is no such checkpoint.
-        CheckpointError: if the last one can't be read.
+    It is the ``best``, the ``last``, or that of a step such as ``3000`` or ``step-3000``; by default the best if the
+    run was validated, else the last. Raises a :class:`ConfigError` if there is no such checkpoint, a
+    :class:`CheckpointError` if the last one can't be read.
     """
     found = {int(path.name[-12:]): path for path in checkpoints(folder / "checkpoints")}
     if not found:

@@ -56,25 +56,17 @@ class Task(NamedTuple):
 class Plan:
     """All that decides what is in a generated store.
 
-    Attributes:
-        segments: how many.
-        seed: another seed is another set of networks.
-        split: training, validation and test sets never share a network, whatever their seeds.
-        kinds: of networks, which take turns; one named twice comes twice as often. A file of roads of one's own is a
-            kind, too; its roads are the same for every split and seed, the traffic is another.
-        duration: seconds of a segment, one of :data:`DURATIONS`.
-        interactive: moving vehicles a segment must have at its first step (N_I).
-
-    Raises:
-        ConfigError: a value out of range; names the field.
+    Raises a :class:`ConfigError` for a value out of range; names the field.
     """
 
-    segments: int
-    seed: int = 0
-    split: Split = "train"
+    segments: int  # how many
+    seed: int = 0  # another seed is another set of networks
+    split: Split = "train"  # training, validation and test sets never share a network, whatever their seeds
+    # of networks, which take turns; one named twice comes twice as often. A file of roads of one's own is a
+    # kind, too; its roads are the same for every split and seed, the traffic is another.
     kinds: tuple[str, ...] = ("town",)
-    duration: int = 10
-    interactive: int = 2
+    duration: int = 10  # seconds of a segment, one of :data:`DURATIONS`
+    interactive: int = 2  # moving vehicles a segment must have at its first step (N_I)
 
     def __post_init__(self) -> None:
         unknown = [kind for kind in self.kinds if kind not in KINDS and not is_own(kind)]

@@ -11,10 +11,7 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import LaneType, RoadMap
 
-REACH, TURN = (
-    1.5,
-    np.deg2rad(30),
-)  # metres, heights counted, and radians within which a lane goes on from another
+REACH, TURN = 1.5, np.deg2rad(30)  # metres in space and radians within which a lane goes on from another
 SAME = 0.1  # metres within which two places are one
 STEP = 1e-3  # metres below which two neighbouring points of a lane have no direction
 TAG = "joined_gaps"  # of a stored segment: how many links were added to its map

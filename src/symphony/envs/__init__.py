@@ -14,20 +14,9 @@ if TYPE_CHECKING:
     from symphony.envs.routes import CHOICE_FEATURES, ROUTE_FEATURES
 
 __all__ = [
-    "CHOICE_FEATURES",
-    "OBJECT_FEATURES",
-    "POINT_FEATURES",
-    "ROUTE_FEATURES",
-    "SELF_FEATURES",
-    "Bicycle",
-    "ConstantVelocity",
-    "Displacement",
-    "DrivingEnv",
-    "ObservationConfig",
-    "SceneBatch",
-    "SceneSource",
-    "collate",
-    "scene",
-]
+    "CHOICE_FEATURES", "OBJECT_FEATURES", "POINT_FEATURES", "ROUTE_FEATURES", "SELF_FEATURES", "Bicycle",
+    "ConstantVelocity", "Displacement", "DrivingEnv", "ObservationConfig", "SceneBatch", "SceneSource",
+    "collate", "scene",
+]  # fmt: skip
 
 __getattr__, __dir__ = lazily(__name__)

@@ -25,8 +25,7 @@ from symphony.geometry.nearest import on_host
 from symphony.streams import fold_in
 
 Event = Literal["collision", "offroad"]
-EVENTS = {"collision": keys.COLLISION, "offroad": keys.OFFROAD}
-"""What can end an episode."""
+EVENTS = {"collision": keys.COLLISION, "offroad": keys.OFFROAD}  # what can end an episode
 NO_ROUTES = "agents observe or draw routes, but their scenes come without: SceneDataset(..., routes=True)"
 NO_GOALS = "agents observe routes and follow none: TransformedEnv(env, RouteGoals()), or start(..., goal)"
 
@@ -81,10 +80,8 @@ class DrivingEnv(EnvBase):
 
     ``reset`` starts the scenes named in the ``scene`` entry of its argument, or draws them at random if there is
     none; where only some rows are reset, they start other scenes of those at hand. ``reset(state, set_state=True)``
-    starts from the given simulation state.
-
-    Raises:
-        ConfigError: for an unknown name in ``ends_on``, both seed and generator, or routes observed and not there.
+    starts from the given simulation state. Raises a :class:`ConfigError` for an unknown name in ``ends_on``, both
+    seed and generator, or routes observed and not there.
     """
 
     batch_locked = False
@@ -139,8 +136,7 @@ class DrivingEnv(EnvBase):
     def scenes(self) -> SceneBatch:
         """The scenes at hand.
 
-        Raises:
-            ConfigError: before the first reset of an environment that draws from a source.
+        Raises a :class:`ConfigError` before the first reset of an environment that draws from a source.
         """
         if self._scenes is None:
             raise ConfigError("no scenes yet: reset draws them from the source")
@@ -150,13 +146,10 @@ class DrivingEnv(EnvBase):
     def scenes(self, scenes: SceneBatch) -> None:
         self._scenes, before = scenes, (self.open_traffic, self.dt)
         # Read here, once: a step or a search must not wait for the device to tell.
-        self.dt = float(scenes.dt[0])
-        """Seconds per step, that of the scenes."""
-        self.decisions = int(scenes.last_step.max())
-        """Actions until the last logged step of the longest scene."""
+        self.dt = float(scenes.dt[0])  # seconds per step, that of the scenes
+        self.decisions = int(scenes.last_step.max())  # actions until the longest scene's last logged step
         drawn_open = self.source is not None and self.source.open_traffic
-        self.open_traffic = drawn_open or scenes.open_traffic
-        """Whether agents enter and leave."""
+        self.open_traffic = drawn_open or scenes.open_traffic  # whether agents enter and leave
         if (self.open_traffic, self.dt if isinstance(self.dynamics, Displacement) else before[1]) != before:
             self._make_specs()
 
@@ -224,11 +217,9 @@ class DrivingEnv(EnvBase):
     ) -> TensorDict:
         """State at the first logged step, as :meth:`reset` returns it.
 
-        Args:
-            scene: rows of the scene batch; its shape is the batch size.
-            rollout: number of the rollout (branch, repetition) within its scene, so that each draws numbers of
-                its own whatever batch it runs in.
-            goal: routes that agents follow; by default none.
+        The shape of ``scene``, rows of the scene batch, is the batch size. The number of a ``rollout`` (branch,
+        repetition) within its scene lets each draw numbers of its own whatever batch it runs in. Goals are the routes
+        that agents follow; by default none.
         """
         rollout = torch.as_tensor(rollout, device=scene.device).expand(scene.shape)
         stream = fold_in(self.scenes.stream[scene], rollout)

@@ -22,10 +22,8 @@ from symphony import keys
 from symphony.errors import ConfigError
 from symphony.geometry.frames import constant, rotate, wrap
 
-WHEELBASE = 0.6
-"""Wheelbase as a fraction of the box length; the axles lie symmetrically about the centre."""
-STEEPEST = 0.3
-"""Largest ratio of sideways to distance that a displacement is made up with."""
+WHEELBASE = 0.6  # wheelbase as a fraction of the box length; the axles lie symmetrically about the centre
+STEEPEST = 0.3  # largest ratio of sideways to distance that a displacement is made up with
 BOUNDS = (-10.0, -15.0), (50.0, 15.0)
 """m/s forward and to the left between which the action spec has displacements; a step takes any."""
 
@@ -116,8 +114,7 @@ class Bicycle:
         effort: metres that an acceleration of 1 m/s^2 counts for in the greedy fit, and a tenth of a radian of
             steering; small, it decides where actions hardly differ, as at standstill, for the gentlest.
 
-    Raises:
-        ConfigError: for a grid of another size.
+    Raises a :class:`ConfigError` for a grid of another size.
     """
 
     max_acceleration: float = 4.0
@@ -169,9 +166,7 @@ class Bicycle:
 
         Continues from the *fitted* state, so errors do not accumulate unseen. Where the next logged step is not
         valid the agent keeps its speed and course, and where it reappears the fit starts anew from the log.
-
-        Returns:
-            Joint action indices [*b, T - 1] and fitted states [*b, T, 4].
+        Gives joint action indices [*b, T - 1] and fitted states [*b, T, 4].
         """
         acceleration, steering = self.grid(log)
         effort = self.effort**2 * (acceleration.square() + (10.0 * steering).square())

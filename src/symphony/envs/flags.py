@@ -20,8 +20,7 @@ from symphony.geometry.polylines import distance_to, signed_distance
 
 _SLACK = 0.1
 """Metres by which circles reach farther than the boxes inside them, far above the rounding of float32."""
-_PAIRS = 1 << 20
-"""Positions times edges that are measured at a time where the nearest is on another level."""
+_PAIRS = 1 << 20  # positions times edges that are measured at a time where the nearest is on another level
 
 
 def collision_flags(objects: Objects, index: Int[Tensor, "M N"]) -> Bool[Tensor, "M N"]:

@@ -24,10 +24,8 @@ from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
 from symphony.roadgraph import LaneGraph
 
-BOUND = 1000.0
-"""What observations are clipped to; they are scaled to numbers near one."""
-TOP_SPEED = 40.0
-"""m/s that the largest continuous action stands for."""
+BOUND = 1000.0  # what observations are clipped to; they are scaled to numbers near one
+TOP_SPEED = 40.0  # m/s that the largest continuous action stands for
 
 Observed = dict[str, NDArray[Any]]
 
@@ -96,9 +94,8 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
     ) -> tuple[Observed, dict[str, Any]]:
         """Start a segment.
 
-        Raises:
-            DataError: the segment that was asked for is not there, or its ego is not seen at its first step.
-            ConfigError: what was asked for is neither an id nor a number.
+        Raises a :class:`DataError` where the one that was asked for is not there, or its ego is not seen at its first
+        step, a :class:`ConfigError` where what was asked for is neither an id nor a number.
         """
         super().reset(seed=seed)
         wanted = (options or {}).get("segment")
@@ -120,8 +117,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
     def step(self, action: Any) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Drive one step.
 
-        Raises:
-            ConfigError: the action is none of the space; continuous ones beyond it are clipped.
+        Raises a :class:`ConfigError` where the action is none of the space; continuous ones beyond it are clipped.
         """
         if isinstance(self.dynamics, Bicycle):
             number = _whole(action)

@@ -20,12 +20,10 @@ from symphony.geometry.frames import constant, levels_apart, wrap
 from symphony.geometry.nearest import nearest, places
 
 OBJECT_FEATURES = 8 + AGENT_FEATURES
-CLEAR = 1.0
-"""Metres that an agent which enters keeps from all others."""
+CLEAR = 1.0  # metres that an agent which enters keeps from all others
 FORESEEN = (0.5, 1.0)
 """Seconds ahead at which its box would meet no other, were everyone to keep speed and course."""
-_PLACES = 1 << 22
-"""Positions times logged steps that are looked at together."""
+_PLACES = 1 << 22  # positions times logged steps that are looked at together
 
 
 class Objects(NamedTuple):

@@ -25,10 +25,8 @@ from symphony.geometry.nearest import nearest, on_host
 __all__ = ["OBJECT_FEATURES", "POINT_FEATURES"]
 
 SELF_FEATURES = 4
-REPAID = 2
-"""Positions in a cell that repay a list of its points."""
-_DISTANCES = 1 << 16
-"""Distances held at a time."""
+REPAID = 2  # positions in a cell that repay a list of its points
+_DISTANCES = 1 << 16  # distances held at a time
 
 
 @dataclass(frozen=True)
@@ -120,15 +118,8 @@ def observe(
     end points, so ties are common: on the CPU they go to the elements that come first, whatever the padding, and
     elements are in the order of the scene.
 
-    Args:
-        scenes: the static part.
-        scene: rows of ``scenes``.
-        step: logged step.
-        objects: all agents of each row.
-        index: those that observe.
-        config: what they see.
-        tables: of ``scenes`` and ``config``; whoever observes a batch of scenes more than once keeps them.
-        routes: what agents see of their routes; without, nothing of routes is observed.
+    Whoever observes a batch of scenes more than once keeps its ``tables``. Without ``routes``, what agents see of
+    them, nothing of routes is observed.
     """
     if config.blind and not config.route:
         return {}

@@ -26,25 +26,20 @@ from symphony.roadgraph import LaneGraph, ground_truth_routes, route_lines, rout
 from symphony.roadgraph.routes import HORIZON
 from symphony.streams import stream_of
 
-SPACING = 3.0
-"""Metres between the points of a route; its last piece may be shorter."""
-POINTS = 64
-"""Points of a route, from its beginning on, by which it is chosen: 189 m."""
+SPACING = 3.0  # metres between the points of a route; its last piece may be shorter
+POINTS = 64  # points of a route, from its beginning on, by which it is chosen: 189 m
 BEHIND, WINDOW = 12, 56
 """Points of a route that are seen: so many behind the agent, so many in all (36 m behind to 129 m ahead)."""
 AHEAD = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20, 27)
 """Points of its route that a vehicle observes, counted from the one nearest to it."""
 ROUTE_FEATURES = 4 + 3 * (len(AHEAD) - 1)
 ALONG_FEATURES = 11
-BESIDE = 20.0
-"""Metres beside its route within which an agent sees where along it something is."""
-STRIDE = 4
-"""Of the points of a route, the share (one in so many) by which the goal policy observes it."""
+BESIDE = 20.0  # metres beside its route within which an agent sees where along it something is
+STRIDE = 4  # of the points of a route, the share (one in so many) by which the goal policy observes it
 CHOICE_FEATURES = 5 * (POINTS // STRIDE)
 TURN_FEATURES = 2 + (POINTS - 2)
 """Where a route begins, and a turn at each of its points but the first and the last."""
-ONWARD = 200.0
-"""Metres that routes reach beyond what the fastest agent can drive."""
+ONWARD = 200.0  # metres that routes reach beyond what the fastest agent can drive
 _FASTER, _FASTEST = 1.1, 45.0
 """What is driven may be faster than the fastest of the log by this factor, up to so many m/s."""
 _BACK, _SEARCHED = 4, 16
@@ -57,9 +52,7 @@ _CUT, _SLACK = 1.5, 3.0
 class RouteTable:
     """Feasible routes of one vehicle from where it begins."""
 
-    points: NDArray[
-        np.float32
-    ]  # [P, 2] of all, one after the other, SPACING apart from beside the vehicle on
+    points: NDArray[np.float32]  # [P, 2] of all, SPACING apart from beside the vehicle on
     count: NDArray[np.int64]  # [G] points of each
     right: NDArray[np.bool_]  # [G] those nearest to the log; several where they part beyond its end
     logged: int  # one of these, drawn from segment and agent alone; -1 where the vehicle is on no lane
@@ -86,12 +79,8 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
     the segment, and reach :data:`ONWARD` metres beyond what can be driven, unless the map ends. Where they can't be
     built, a :class:`~symphony.errors.DataWarning` says so, and there are none.
 
-    Args:
-        segment: with the agent's log.
-        graph: of its lanes.
-        agent: row of the segment.
-        begin: step at which the agent comes in; routes begin with its first valid state from there on, of one that
-            comes in later with the first on a lane.
+    Routes begin with the agent's first valid state from step ``begin``, at which it comes in, on; of one that comes
+    in later with the first on a lane.
     """
     steps, starts, first = begin + np.flatnonzero(segment.valid[agent, begin:]), [], 0
     for first in steps.tolist() if begin else steps[:1].tolist():

@@ -33,14 +33,10 @@ from symphony.streams import stream_of
 if TYPE_CHECKING:
     from symphony.envs.observation import ObservationConfig
 
-SPACING = 2.0
-"""Metres between the points that stand for a polyline in the observation."""
-BOUNDARY_TOLERANCE = 0.02
-"""Metres by which the simplified road boundary may depart from the given one."""
-MARGIN = 5.0
-"""Metres beyond the convex hull of the lanes that still belong to the map."""
-BESIDE = 2.5
-"""Metres to either side of the end of a lane within which an agent leaves by it."""
+SPACING = 2.0  # metres between the points that stand for a polyline in the observation
+BOUNDARY_TOLERANCE = 0.02  # metres by which the simplified road boundary may depart from the given one
+MARGIN = 5.0  # metres beyond the convex hull of the lanes that still belong to the map
+BESIDE = 2.5  # metres to either side of the end of a lane within which an agent leaves by it
 
 
 class PointType(IntEnum):
@@ -116,8 +112,7 @@ def leaving(before: Tensor, after: Tensor, exits: Tensor, hull: Tensor) -> Bool[
 class SceneSource(Protocol):
     """Where an environment draws its scenes from, such as a store that is larger than memory."""
 
-    interactive: int
-    """N, interactive agents per scene."""
+    interactive: int  # N, interactive agents per scene
 
     @property
     def dt(self) -> float:
@@ -208,17 +203,10 @@ def scene(
 ) -> SceneBatch:
     """One run segment as a batch of one scene, without padding.
 
-    Args:
-        segment: a validated run segment.
-        interactive: how many agents are interactive (chosen by the paper's rule), or their rows.
-        graph: of the segment's lanes; with it the scene holds the routes of its interactive agents.
-        number: of the segment among those that scenes are drawn from.
-        edge: of the map; with it the traffic is open: interactive agents enter where the log first has them within
-            the map, and leave at its edge.
-        background: [N] which of the interactive agents a rule drives; by default none.
-
-    Raises:
-        DataError: if the segment has fewer usable agents.
+    Interactive are so many agents, chosen by the paper's rule, or those of some rows, of which a rule drives the
+    ``background`` [N]. With the lanes' graph the scene holds their routes; with the edge of the map the traffic is
+    open: they enter where the log first has them within the map, and leave at its edge. ``number`` is the segment's
+    among those that scenes are drawn from. Raises a :class:`DataError` if the segment has fewer usable agents.
     """
     if isinstance(interactive, int):
         interactive = interactive_agents(segment, interactive).tolist()
@@ -266,10 +254,8 @@ def scene(
 def collate(scenes: Sequence[SceneBatch], agents: int = 0) -> SceneBatch:
     """Stack scenes into one batch, padded to the largest of each size, and to so many interactive agents.
 
-    Padded steps repeat nothing: they are masked by ``log_valid`` and lie past ``last_step``.
-
-    Raises:
-        DataError: for scenes of different time steps.
+    Padded steps repeat nothing: they are masked by ``log_valid`` and lie past ``last_step``. Raises a
+    :class:`DataError` for scenes of different time steps.
     """
     steps = torch.cat([item.dt for item in scenes])
     if bool((steps != steps[0]).any()):
@@ -402,11 +388,8 @@ LIGHT_COLUMN = 6 + len(PointType)
 
 
 class Tables:
-    """Rows of features, flat indices and cells of the scenes of a batch, each made when first used.
-
-    Args:
-        scenes: the static part; must not change afterwards.
-        config: of the observation.
+    """Rows of features, flat indices and cells of the scenes of a batch, each made when first used; these must not
+    change.
     """
 
     def __init__(self, scenes: SceneBatch, config: ObservationConfig) -> None:

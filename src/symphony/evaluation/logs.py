@@ -23,8 +23,7 @@ from symphony.roadgraph import LaneGraph, visited_regions
 from symphony.rollouts.driving import playback
 
 PERCENTILES = (1, 5, 50, 95, 99)
-STRAIGHT = 0.5
-"""Radians a branch may turn and still be called straight."""
+STRAIGHT = 0.5  # radians a branch may turn and still be called straight
 MOST_FAULTS, LEAST_DIRECTION = 0.5, 15.0
 """Percent of collisions and of time off the road that a good set has at most, and of choices in each direction."""
 _CHUNK = 64
@@ -35,15 +34,13 @@ def measure(
 ) -> dict[str, Any]:
     """Measure the logged driving of the interactive agents (see ``interactive_agents``) in every segment.
 
-    Returns:
-        As JSON can hold it: ``segments`` and ``skipped`` (with fewer agents); ``collision_rate`` (percent of segments
-        in which one of them overlaps another agent) and ``offroad_time`` (percent of their steps), both without the
-        first state; ``directions`` (percent of their ``choices`` at branching lanes); ``speed``, ``acceleration``,
-        ``yaw_rate`` and ``fit_error`` (metres between log and its fit to the action space, at the end) as percentiles
-        and so on. NaN for what no segment has.
+    As JSON can hold it: ``segments`` and ``skipped`` (with fewer agents); ``collision_rate`` (percent of segments in
+    which one of them overlaps another agent) and ``offroad_time`` (percent of their steps), both without the first
+    state; ``directions`` (percent of their ``choices`` at branching lanes); ``speed``, ``acceleration``, ``yaw_rate``
+    and ``fit_error`` (metres between log and its fit to the action space, at the end) as percentiles and so on. NaN
+    for what no segment has.
 
-    Raises:
-        DataError: no segment has so many interactive agents.
+    Raises a :class:`DataError` where no segment has so many interactive agents.
     """
     sums = defaultdict[str, list[Any]](list)
 

@@ -27,8 +27,7 @@ COLUMNS = {
 }
 """Numbers of the table, their headings and digits."""
 _ABOUT = ("segment", "rollout", "group", "failed", "progress_ratio", "beyond_route", "no_route")
-_RUN = (*_ABOUT, "collision", "at_fault_collision", "red_lights", "offroad_time")
-"""Of each run, in a record."""
+_RUN = (*_ABOUT, "collision", "at_fault_collision", "red_lights", "offroad_time")  # of each run, in a record
 _FREE = ("planner", "planner_seconds", "rollouts")
 """Settings that are the planner's own, and how often it is tried."""
 _BESIDE_LOG = ("interactive", "others", "open_traffic", "radius", "duration", "seed")
@@ -52,14 +51,11 @@ def run_score(run: Mapping[str, Any]) -> float | None:
 def planner_record(folder: RolloutFolder) -> Record:
     """Return how the planner in a folder of rollouts drove.
 
-    Returns:
-        ``planner``, ``crowd`` (who drove the other interactive agents; ``playback`` for the log), ``settings`` and
-        ``store`` of the simulation; the totals of :func:`symphony.evaluation.report.total_numbers` with the ego
-        evaluated, progress relative to the log's along routes only; ``score``, the mean of :func:`run_score`,
-        ``score_se``, and ``score_runs`` that have one; ``per_run``.
-
-    Raises:
-        DataError: there is no planner in it, or a file of it can't be read.
+    That is ``planner``, ``crowd`` (who drove the other interactive agents; ``playback`` for the log), ``settings``
+    and ``store`` of the simulation; the totals of :func:`symphony.evaluation.report.total_numbers` with the ego
+    evaluated, progress relative to the log's along routes only; ``score``, the mean of :func:`run_score`,
+    ``score_se``, and ``score_runs`` that have one; ``per_run``. Raises a :class:`DataError` where there is no planner
+    in it, or a file of it can't be read.
     """
     about = folder.about
     if "ego" not in about.drivers:
@@ -123,10 +119,8 @@ def _crowds(records: Sequence[Record]) -> dict[str, list[Record]]:
 
 
 def check_crowds(records: Sequence[Record]) -> None:
-    """Refuse to put planners beside each other that did not meet the same.
-
-    Raises:
-        ConfigError: of two records of one crowd the store, the settings or all segments differ; names what does.
+    """Refuse to put planners beside each other that did not meet the same, with a :class:`ConfigError` that names
+    what differs between two records of one crowd: the store, the settings or all segments.
     """
     first: dict[str, Record] = {}
     for one in records:

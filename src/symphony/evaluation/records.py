@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
 FORMAT, FOLDER = 2, "evaluations"
 _LONGEST = 200  # letters in a name; file systems allow 255 with what is added while a file is written
-_MEMORY = ("batch", "device", "workers", "engine")
-"""Settings that change no result."""
+_MEMORY = ("batch", "device", "workers", "engine")  # settings that change no result
 _NAMED = ("search", "trees", "branches", "rule", "prune_every", "temperature", "interactive", "rollouts")
 _USUAL = {
     field.name: field.default
@@ -47,14 +46,13 @@ _PARTS: dict[str, tuple[str, ...]] = {
 def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> dict[str, Any]:
     """Return an evaluation of an agent on a store as JSON can hold it.
 
-    Returns:
-        The numbers of ``result``; ``playback`` and ``constant_velocity``, those of the baselines; ``cost``, seconds
-        of CPU time for the ``simulation`` of all rollouts and ``steps`` of rollouts or branches in it; ``run``, facts
-        of a trained agent and which ``checkpoint`` was taken, and whether that is ``named``, not its own choice (None
-        for a baseline); ``data``, ``name`` and ``checksum`` of the store; ``config``, the settings with what was left
-        to the agent filled in; ``horizon``, seconds of the longest rollout; ``curvature``, histograms [201] of the
-        regions visited, ``policy`` and ``log``, and ``parts``, pseudo-values of the divergence by recording;
-        ``per_segment``, a row for each. :func:`symphony.wosac.evaluate.wosac_parts` adds the WOSAC score.
+    The numbers of ``result``; ``playback`` and ``constant_velocity``, those of the baselines; ``cost``, seconds of
+    CPU time for the ``simulation`` of all rollouts and ``steps`` of rollouts or branches in it; ``run``, facts of a
+    trained agent and which ``checkpoint`` was taken, and whether that is ``named``, not its own choice (None for a
+    baseline); ``data``, ``name`` and ``checksum`` of the store; ``config``, the settings with what was left to the
+    agent filled in; ``horizon``, seconds of the longest rollout; ``curvature``, histograms [201] of the regions
+    visited, ``policy`` and ``log``, and ``parts``, pseudo-values of the divergence by recording; ``per_segment``, a
+    row for each. :func:`symphony.wosac.evaluate.wosac_parts` adds the WOSAC score.
     """
     policy, log = (counts.tolist() for counts in result.metrics.curvature_histograms())
     divergence, names = result.metrics.curvature_divergence()

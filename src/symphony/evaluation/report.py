@@ -216,14 +216,12 @@ def _most(values: Array, sign: float = 1.0) -> float | None:
 
 
 def total_numbers(rows: Sequence[Row]) -> Row:
-    """Return the totals of some runs.
+    """Return the totals of some runs: ``runs`` (failed ones included), ``failed_runs``, ``segments`` and ``groups``.
 
-    Returns:
-        ``runs`` (failed ones included), ``failed_runs``, ``segments`` and ``groups``; over the runs that did not fail
-        the means (``*_rate`` in percent of runs, ``*_time`` in percent of the evaluated agents' time), each with its
-        standard error over groups under ``*_se`` (None for a single group), the segments that have such a number
-        under ``*_segments`` and, of a percentage that is zero, its exact bound over groups under ``*_bound`` (see
-        :func:`symphony.metrics.intervals.zero_bound`); the largest ``max_*`` and the least ``min_ttc``.
+    Over the runs that did not fail the means (``*_rate`` in percent of runs, ``*_time`` in percent of the evaluated
+    agents' time), each with its standard error over groups under ``*_se`` (None for a single group), the segments
+    that have such a number under ``*_segments`` and, of a percentage that is zero, its exact bound over groups under
+    ``*_bound`` (:func:`symphony.metrics.intervals.zero_bound`); the largest ``max_*`` and the least ``min_ttc``.
     """
     good = [row for row in rows if not row["failed"]]
     names, member = np.unique([row["group"] for row in good], return_inverse=True)

@@ -57,8 +57,7 @@ class Entry:
     def number(self, key: str, where: Mapping[str, Any] | None = None) -> float:
         """Return a number of the record, or of a part of it; NaN for a mean over nothing.
 
-        Raises:
-            DataError: it is no number.
+        Raises a :class:`DataError` where it is no number.
         """
         where = self.record if where is None else where
         if key == "cost":
@@ -90,14 +89,9 @@ def collect(
 ) -> tuple[list[Entry], dict[str, list[Path]]]:
     """Return the evaluated runs of a setting, and the runs that are left out by the reason.
 
-    Args:
-        folders: runs, or folders of runs.
-        setting: of the runs that are wanted.
-        patterns: names of evaluations; those that the first fitting one fits count (``*`` is anything).
-
-    Raises:
-        ConfigError: no runs, two of one method and seed, or two evaluations of one of them in one way to simulate.
-        DataError: a file can't be read.
+    Of the evaluations whose names (``*`` is anything) fit some patterns those that the first one fits count. Raises a
+    :class:`ConfigError` for no runs, two of one method and seed, or two evaluations of one of them in one way to
+    simulate, a :class:`DataError` where a file can't be read.
     """
     entries, runs = dict[tuple[str, str, int], Entry](), dict[tuple[str, int], Path]()
     left_out: dict[str, list[Path]] = {}
@@ -188,20 +182,15 @@ def paper_figures(setting: Setting, dataset: PaperData) -> dict[str, dict[str, t
 def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | None = None) -> dict[str, Any]:
     """Return the table of some evaluated runs of a setting; their order does not matter.
 
-    Args:
-        entries: the runs, of one method with one seed one for each way to simulate.
-        setting: theirs.
-        dataset: whose figures from the paper stand beside ours; only what the paper has stands beside them.
+    There is one run of a method with a seed for each way to simulate. With a dataset, the paper's figures on it stand
+    beside ours, and nothing that the paper does not have.
 
-    Returns:
-        As JSON can hold it: ``columns``, the metrics; ``rows`` in the paper's order, each with a cell for each metric
-        (``mean``, ``se`` over seeds, ``values``, and ``best``, whether no method of its family is better), the
-        paper's cells in ``paper``, and ``way`` where its method has a row for each way to simulate; ``notes``.
-
-    Raises:
-        ConfigError: no runs, runs evaluated on different segments or in other traffic, seeds of a method evaluated
-            in different ways, or figures that the paper does not have.
-        DataError: an evaluation lacks a number that is needed.
+    As JSON can hold it: ``columns``, the metrics; ``rows`` in the paper's order, each with a cell for each metric
+    (``mean``, ``se`` over seeds, ``values``, and ``best``, whether no method of its family is better), the paper's
+    cells in ``paper``, and ``way`` where its method has a row for each way to simulate; ``notes``. Raises a
+    :class:`ConfigError` for no runs, runs evaluated on different segments or in other traffic, seeds of a method
+    evaluated in different ways, or figures that the paper does not have, a :class:`DataError` where an evaluation
+    lacks a number that is needed.
     """
     figures = paper_figures(setting, dataset) if dataset else {}
     if not entries or (dataset is not None and not figures):

@@ -10,9 +10,9 @@ if TYPE_CHECKING:
     from symphony.geometry.boxes import box_corners as box_corners
     from symphony.geometry.boxes import box_gap as box_gap
     from symphony.geometry.boxes import boxes_overlap as boxes_overlap
-    from symphony.geometry.contact import contact_share as contact_share
-    from symphony.geometry.contact import meeting_time as meeting_time
-    from symphony.geometry.contact import pose_at as pose_at
+    from symphony.geometry.boxes import contact_share as contact_share
+    from symphony.geometry.boxes import meeting_time as meeting_time
+    from symphony.geometry.boxes import pose_at as pose_at
     from symphony.geometry.frames import LEVEL as LEVEL
     from symphony.geometry.frames import forward_speed as forward_speed
     from symphony.geometry.frames import levels_apart as levels_apart

@@ -24,25 +24,16 @@ Reals = NDArray[np.floating[Any]]
 Indices = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-POINT_CELL = 8.0
-"""Metres of a cell's side, for points."""
-EDGE_CELL = 4.0
-"""Metres of a cell's side, for the edges of the road."""
-ROWS = 64
-"""Positions whose candidates are looked at together, so that they stay in the cache."""
+POINT_CELL = 8.0  # metres of a cell's side, for points
+EDGE_CELL = 4.0  # metres of a cell's side, for the edges of the road
+ROWS = 64  # positions whose candidates are looked at together, so that they stay in the cache
 
-_MARGIN = 8.0
-"""Metres of cells beyond the outermost element."""
-_SLACK = 0.02
-"""Metres by which lists reach farther than they need to, far above the rounding of float32."""
-_CELLS = 1 << 14
-"""Most cells of a map; larger maps get larger cells."""
-_BLOCK = 1 << 17
-"""Distances held at a time while lists are made."""
-_MANY = 256
-"""Neighbours above which most of them lie far away, where the size of a cell matters less."""
-_WORTH = 3
-"""Elements of a map for each that is looked for, below which a list saves nothing."""
+_MARGIN = 8.0  # metres of cells beyond the outermost element
+_SLACK = 0.02  # metres by which lists reach farther than they need to, far above the rounding of float32
+_CELLS = 1 << 14  # most cells of a map; larger maps get larger cells
+_BLOCK = 1 << 17  # distances held at a time while lists are made
+_MANY = 256  # neighbours above which most of them lie far away, where the size of a cell matters less
+_WORTH = 3  # elements of a map for each that is looked for, below which a list saves nothing
 _FILLING = Lock()
 
 
@@ -147,10 +138,8 @@ class Cells(ABC):
 class PointCells(Cells):
     """Cells for the nearest points.
 
-    Args:
-        x: [B, P] of the points; infinity where there is none.
-        y: [B, P].
-        count: K, how many are looked for. A map with few more has no cells.
+    Takes x and y of the points [B, P], infinity where there is none, and how many are looked for: a map with few more
+    has no cells.
     """
 
     def __init__(self, x: Reals, y: Reals, count: int) -> None:
@@ -187,12 +176,8 @@ class PointCells(Cells):
 class EdgeCells(Cells):
     """Cells for the nearest edge of the road, and the side of it on which whole cells lie.
 
-    Args:
-        start: [B * E, 2] of the directed edges of all maps.
-        end: [B * E, 2].
-        exists: [B, E] which of them there are and have a length.
-        previous: [B * E] number of the edge that ends where this one starts, -1 if none.
-        following: [B * E] number of the edge that starts where this one ends, -1 if none.
+    Takes start and end of the directed edges of all maps [B * E, 2], which of them there are and have a length [B,
+    E], and the numbers of the edges before and after each [B * E], -1 if none.
     """
 
     def __init__(

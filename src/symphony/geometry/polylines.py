@@ -15,12 +15,9 @@ from symphony.geometry.nearest import on_host
 
 NO_BOUNDARY = -1e6
 """Signed distance, in metres, where a scene has no boundary at all: nothing is off the road there."""
-CLOSED_WITHIN = 1e-3
-"""Metres between the ends of two lines (or of one line) below which they count as joined."""
-_BLOCK = 1 << 18
-"""Distances held at a time on the CPU, so that the temporaries stay in the cache."""
-_FAR = 1e15
-"""Offset of a segment that is not there."""
+CLOSED_WITHIN = 1e-3  # metres between the ends of two lines (or of one line) below which they count as joined
+_BLOCK = 1 << 18  # distances held at a time on the CPU, so that the temporaries stay in the cache
+_FAR = 1e15  # offset of a segment that is not there
 
 
 def signed_distance(
@@ -38,14 +35,8 @@ def signed_distance(
     segments gives :data:`NO_BOUNDARY`. A point that is not finite has no finite distance and changes nothing for
     others. Differentiable in ``points`` (the nearest segment is held fixed).
 
-    Args:
-        points: [B, M, 2] metres.
-        start: [B, E, 2] first point of each segment.
-        end: [B, E, 2] last point of each segment.
-        valid: [B, E] which segments exist.
-        previous: [B, E] index of the segment that ends where this one starts, -1 if none. With it and
-            ``following`` the sign is right at corners too, where the nearest point is shared by two segments.
-        following: [B, E] index of the segment that starts where this one ends, -1 if none.
+    Takes the ends of the segments, which of them exist, and the indices [B, E] of those that end where one starts and
+    start where it ends, -1 if none: with them the sign is right at corners, too, which two segments share.
     """
     if start.shape[1] == 0:
         return points.sum(-1) * 0 + NO_BOUNDARY
@@ -206,14 +197,8 @@ def segments_of(
 
     Line k is ``points[offsets[k]:offsets[k + 1]]``. A line whose last point lies within :data:`CLOSED_WITHIN`
     of its first one is a ring; a line that starts where exactly one other line ends continues it. Repeated
-    points are dropped.
-
-    Args:
-        points: [P, 2 or more] of which x and y are used.
-        offsets: [K + 1].
-
-    Returns:
-        Start [E, 2], end [E, 2], and the indices [E] of the previous and the following segment (-1: none).
+    points are dropped. Gives start [E, 2], end [E, 2], and the indices [E] of the previous and the following segment
+    (-1: none).
     """
     points = np.asarray(points)[:, :2]
     counts = np.diff(offsets)
@@ -240,12 +225,9 @@ Reals = NDArray[np.float64]
 
 NEAR = 1.0
 """Metres by which an earlier pass may be farther away than the nearest and is still where a path begins."""
-_SLACK = 3.0
-"""Metres along the line, besides the way driven, within which the next place is looked for."""
-_CUT = 1.5
-"""Metres along the line to a metre driven: who cuts a corner gets on faster."""
-_TOGETHER = 1 << 15
-"""Distances of points to pieces that are found together."""
+_SLACK = 3.0  # metres along the line, besides the way driven, within which the next place is looked for
+_CUT = 1.5  # metres along the line to a metre driven: who cuts a corner gets on faster
+_TOGETHER = 1 << 15  # distances of points to pieces that are found together
 
 
 def stations_along(
@@ -258,13 +240,8 @@ def stations_along(
     A path begins at the earliest place that is nearest to it, or nearly so, and goes on from there: a step leads no
     farther along the line than the way that was driven, and some metres.
 
-    Args:
-        lines: shorter ones end with their last point again.
-        path: in the order of time.
-        valid: which of its points exist.
-
-    Raises:
-        ValueError: a point that exists is not finite; names line and step.
+    Shorter lines end with their last point again. Raises ValueError where a point that exists is not finite; names
+    line and step.
     """
     wrong = np.argwhere(valid & ~np.isfinite(path).all(-1))
     if len(wrong):
@@ -316,13 +293,7 @@ def to_pieces(
     start: Reals, direction: Reals, length: Reals, point: NDArray[np.floating]
 ) -> tuple[Reals, Reals, Reals]:
     """Metres along each piece of a line to its place nearest to a point, what lies between the two [..., 2], and how
-    far that is.
-
-    Args:
-        start: [..., 2] of each piece, in metres.
-        direction: [..., 2] unit vectors; zero for pieces of no length.
-        length: [...] metres.
-        point: [..., 2] metres.
+    far that is. Pieces have a start [..., 2], a unit direction (zero for pieces of no length) and a length [...].
     """
     # Component by component: sums over a last dimension of 2 are slow.
     x, y = (point[..., k] - start[..., k] for k in (0, 1))

@@ -17,10 +17,8 @@ from torch import Tensor
 from symphony.geometry import wrap
 
 TURNS = ("right", "straight", "left")
-TURNED = math.radians(45)
-"""A route turns where its direction has changed by this much since its beginning."""
-SHORTEST = 0.01
-"""Metres of a piece of a route that has a direction."""
+TURNED = math.radians(45)  # a route turns where its direction has changed by this much since its beginning
+SHORTEST = 0.01  # metres of a piece of a route that has a direction
 
 
 def route_turns(
@@ -28,10 +26,7 @@ def route_turns(
 ) -> Int[Tensor, "*b"]:
     """Which way routes first turn, as the place in :data:`TURNS`; straight on where they never do.
 
-    Args:
-        points: of each route, in metres.
-        count: of them that exist.
-        turned: change of direction in radians, since the first two points, that is a turn.
+    Takes the points of each route, in metres, and how many of them exist.
     """
     step = points.diff(dim=-2)
     direction = torch.atan2(step[..., 1], step[..., 0])
@@ -47,19 +42,14 @@ def route_turns(
 
 @dataclass(frozen=True)
 class Choice:
-    """What a search made of the goals of one segment.
+    """What a search made of the goals of one segment."""
 
-    Attributes:
-        drawn: [3] agents of all branches by the turn of the route they drew, see :data:`TURNS`.
-        kept: [3] agents of the rollouts by the turn of the route they follow.
-        variation: total variation between drawn and kept routes (0 to 1), mean over agents; NaN without a route.
-        founders: first branches that some rollout descends from, mean over trees.
-    """
-
+    # [3] agents of all branches by the turn of the route they drew, see :data:`TURNS`
     drawn: NDArray[np.int64]
-    kept: NDArray[np.int64]
+    kept: NDArray[np.int64]  # [3] agents of the rollouts by the turn of the route they follow
+    # total variation between drawn and kept routes (0 to 1), mean over agents; NaN without a route
     variation: float
-    founders: float
+    founders: float  # first branches that some rollout descends from, mean over trees
 
 
 def choices(
@@ -70,11 +60,8 @@ def choices(
 ) -> list[Choice]:
     """What a search made of the goals of each segment.
 
-    Args:
-        drawn: number of the route that each agent of each branch drew, -1 for none.
-        kept: number of the route that each agent of each rollout follows, -1 for none.
-        turn: which way each route turns, from :func:`route_turns`.
-        founders: first branches of each tree with descendants.
+    Takes the numbers of the routes that the agents of all branches drew and that those of the rollouts follow, -1 for
+    none; which way each route turns (:func:`route_turns`); and the first branches of each tree with descendants.
     """
     found = []
     for b in range(len(drawn)):

@@ -23,12 +23,8 @@ def ratio(
 ) -> tuple[float, float]:
     """Ratio of sums and its standard error over groups (linearised; NaN for a single one).
 
-    Groups without anything to count are no samples: of two recordings of which one is empty there is no error.
-
-    Args:
-        total: [segments] what each adds to the numerator.
-        weight: [segments] what each adds to the denominator.
-        member: [segments] number of the group of each.
+    Takes what each segment adds to numerator and denominator, and the number of its group. Groups without anything to
+    count are no samples: of two recordings of which one is empty there is no error.
     """
     if weight.sum() == 0:
         return math.nan, math.nan
@@ -52,11 +48,8 @@ def grouped_mean(
 
 
 def clustered_mean(values: NDArray[np.float64], member: NDArray[np.int64]) -> tuple[float, float]:
-    """Mean of the finite ones of some values and its standard error, where those of one group are not independent.
-
-    Args:
-        values: [K].
-        member: [K] number of the group of each.
+    """Mean of the finite ones of some values and its standard error, where those of one group (its number in
+    ``member``) are not independent.
     """
     known = np.isfinite(values)
     return ratio(values[known], np.ones(known.sum()), member[known])

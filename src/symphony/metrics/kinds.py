@@ -18,12 +18,9 @@ from torch import Tensor
 
 from symphony.geometry import box_gap, contact_share, levels_apart, pose_at, rotate, wrap
 
-SAME_WAY = math.radians(45)
-"""Largest angle between the headings of two agents that go the same way."""
-OPPOSITE_WAY = math.radians(135)
-"""Smallest angle between the headings of two agents that go opposite ways."""
-STANDING = 0.5
-"""Speed in m/s up to which an agent counts as standing."""
+SAME_WAY = math.radians(45)  # largest angle between the headings of two agents that go the same way
+OPPOSITE_WAY = math.radians(135)  # smallest angle between the headings of two agents that go opposite ways
+STANDING = 0.5  # speed in m/s up to which an agent counts as standing
 _SLACK = 0.01
 
 
@@ -61,19 +58,12 @@ _TYPES = {2: CollisionKind.PEDESTRIAN, 3: CollisionKind.CYCLIST}
 
 
 class CollisionKinds(NamedTuple):
-    """The first collision of every interactive agent, all `[..., N]`.
+    """The first collision of every interactive agent, all `[..., N]`."""
 
-    Attributes:
-        kind: int64 :class:`CollisionKind`, -1 for no collision.
-        step: int64 simulated step, from 0, -1 for no collision.
-        other: int64 row of A of the agent it collided with, -1 for no collision.
-        playback: bool, whether that one is no interactive agent.
-    """
-
-    kind: Int[Tensor, "*lead N"]
-    step: Int[Tensor, "*lead N"]
-    other: Int[Tensor, "*lead N"]
-    playback: Bool[Tensor, "*lead N"]
+    kind: Int[Tensor, "*lead N"]  # int64 :class:`CollisionKind`, -1 for no collision
+    step: Int[Tensor, "*lead N"]  # int64 simulated step, from 0, -1 for no collision
+    other: Int[Tensor, "*lead N"]  # int64 row of A of the agent it collided with, -1 for no collision
+    playback: Bool[Tensor, "*lead N"]  # bool, whether that one is no interactive agent
 
     def first(self) -> tuple[Int[Tensor, "*lead"], Bool[Tensor, "*lead"]]:
         """Kind (-1 for none) and `playback` of the first collision of each rollout.
@@ -111,20 +101,10 @@ def collision_kinds(
     kind, because after the step fast boxes lie far inside each other, or beyond; where the other is not valid before,
     those after it.
 
-    Args:
-        collided: [..., N, T] whether an agent collides in a step, as :func:`symphony.metrics.collisions` finds it.
-        state: [..., N, T+1, 4] x, y, heading, speed of the interactive agents.
-        exists: [..., N, T+1] whether they are there.
-        subject: [..., N] their rows of A; a negative one stands for no agent.
-        log_state: [..., A, T+1, 5] poses of all agents as logged; the rows of the interactive agents are not read.
-        log_valid: [..., A, T+1].
-        size: [..., A, 2] length and width.
-        agent_type: [..., A] ``AgentType`` numbers.
-        height: height and level of the interactive agents and of all as logged; nobody meets another on another
-            level, as :func:`symphony.metrics.collisions` has it.
-
-    Raises:
-        ValueError: for a flagged agent that touches nobody.
+    Takes whether an agent collides in a step (see :func:`symphony.metrics.collisions`); x, y, heading and speed of
+    the interactive agents, whether they are there, and their rows of A, where a negative one stands for no agent;
+    poses and validity of all agents as logged, of which the rows of the interactive ones are not read; length and
+    width, ``AgentType`` numbers, and heights and levels. Raises ValueError for a flagged agent that touches nobody.
     """
     ranks = ((collided, 2), (state, 3), (exists, 2), (subject, 1), (log_state, 3), (log_valid, 2), (size, 2))
     # One leading dimension more, so that there always is one.
@@ -237,12 +217,8 @@ def kind_of_contact(
 ) -> Int[Tensor, " M"]:
     """:class:`CollisionKind` [M] of contacts, whoever the other is, from the point of view of the first agent.
 
-    Args:
-        one: poses of the agent before and after the step.
-        two: poses of the other before and after the step.
-        share: of the step after which they first overlap.
-        size_one: box of the agent.
-        size_two: box of the other.
+    Takes the poses of both before and after the step, the share of it after which they first overlap, and their
+    boxes.
     """
     sizes = size_one, size_two
     turn = wrap(two[0][:, 2] - one[0][:, 2])

@@ -11,10 +11,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-REACH = 1.5
-"""Metres within which two paths are at the same place, about half a lane."""
-_FINER = 4
-"""Parts of a step at which paths are looked at: at the log's rate a vehicle may jump over the place."""
+REACH = 1.5  # metres within which two paths are at the same place, about half a lane
+_FINER = 4  # parts of a step at which paths are looked at: in a whole one a vehicle may jump over the place
 
 
 def passing_gap(
@@ -63,20 +61,13 @@ def _finer(
 
 @dataclass(frozen=True)
 class OrderStatistics:
-    """How rollouts keep the order in which K pairs of agents pass, NaN where there is nothing to count.
+    """How rollouts keep the order in which K pairs of agents pass, NaN where there is nothing to count."""
 
-    Attributes:
-        pairs: that meet in the log, one after the other.
-        kept: share of their rollouts in which the same one goes first.
-        reversed: share in which the other one does.
-        apart: share in which the paths don't meet, or both are there at once.
-        gap_error: mean absolute difference of the seconds between the two from the log's, where they meet.
-    """
-
-    pairs: int
-    kept: float
-    reversed: float
-    apart: float
+    pairs: int  # that meet in the log, one after the other
+    kept: float  # share of their rollouts in which the same one goes first
+    reversed: float  # share in which the other one does
+    apart: float  # share in which the paths don't meet, or both are there at once
+    # mean absolute difference of the seconds between the two from the log's, where they meet
     gap_error: float
 
 

@@ -15,25 +15,17 @@ from torch import Tensor
 from symphony.geometry import contact_share, levels_apart
 
 _SLACK = 1e-3
-_PAIRS = 1 << 22
-"""Pairs of agents, times states, that are looked at together: more would not stay in the processor's cache."""
+_PAIRS = 1 << 22  # pairs of agents, times states, looked at together: more would not stay in the cache
 
 
 class Meetings(NamedTuple):
-    """Boxes that touch in a step, in no particular order, all [E].
+    """Boxes that touch in a step, in no particular order, all [E]."""
 
-    Attributes:
-        row: of R worlds.
-        subject: of N subjects.
-        other: of A agents.
-        step: from state ``step`` to the next one; with ``at_states`` the state.
-        share: of the step after which they first overlap, see :func:`symphony.geometry.contact_share`.
-    """
-
-    row: Int[Tensor, " E"]
-    subject: Int[Tensor, " E"]
-    other: Int[Tensor, " E"]
-    step: Int[Tensor, " E"]
+    row: Int[Tensor, " E"]  # of R worlds
+    subject: Int[Tensor, " E"]  # of N subjects
+    other: Int[Tensor, " E"]  # of A agents
+    step: Int[Tensor, " E"]  # from state ``step`` to the next one; with ``at_states`` the state
+    # of the step after which they first overlap, see :func:`symphony.geometry.contact_share`
     share: Float[Tensor, " E"]
 
 
@@ -52,15 +44,9 @@ def meetings(
     Between two states centres move straight and headings turn evenly; who was not there at the first of them is
     looked at where it is at the second. Boxes that only touch do not overlap.
 
-    Args:
-        position: of box centres.
-        heading: of boxes.
-        size: length and width.
-        valid: an agent that is not valid meets nobody, whatever its other numbers are.
-        subject: rows of A; a negative one stands for no agent.
-        height: and level; those on two levels both before and after a step do not meet
-            (:func:`symphony.geometry.levels_apart`).
-        at_states: look at states only, not at what is between them.
+    Takes box centres, headings, length and width, and what is valid: an agent that is not meets nobody, whatever its
+    other numbers are. A negative row of A among the subjects stands for no agent. Agents on two levels both before
+    and after a step, by their height and level, do not meet (:func:`symphony.geometry.levels_apart`).
     """
     last = slice(None) if at_states else slice(1, None)
     first = last if at_states else slice(-1)
@@ -118,17 +104,8 @@ def collisions(
     at_states: bool = False,
 ) -> Bool[Tensor, "*lead N T"]:
     """Whether the oriented box of each subject overlaps any other agent's in each of the U - 1 steps between states,
-    or with ``at_states`` at each of the U states (as the paper and WOSAC count), see :func:`meetings`. Leading
-    dimensions broadcast.
-
-    Args:
-        position: [..., A, U, 2] box centres.
-        heading: [..., A, U].
-        size: [..., A, 2] length and width.
-        valid: [..., A, U].
-        subject: [..., N] indices into A; a negative one stands for no agent.
-        height: [..., A, U, 2] height and level; those on two levels do not meet.
-        at_states: look at states only.
+    or with ``at_states`` at each of the U states (as the paper and WOSAC count), see :func:`meetings`, which
+    takes the same. Leading dimensions broadcast.
     """
     lead = torch.broadcast_shapes(
         position.shape[:-3], heading.shape[:-2], size.shape[:-2], valid.shape[:-2], subject.shape[:-1]

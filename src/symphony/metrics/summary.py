@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -17,18 +17,86 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from symphony.metrics.choices import Choice, choice_numbers
-from symphony.metrics.curvature import (
-    BINS,
-    Divergence,
-    curvature_histogram,
-    sampled_divergence,
-    sampling_floor,
-)
 from symphony.metrics.intervals import ratio, summed, zero_bound
 from symphony.metrics.kinds import STANDING, CollisionKind, CollisionKinds
 
-WIDTH, FASTEST = 0.5, 45.0
-"""Bins of speeds, and the last of them, in m/s."""
+DRAWS = 200  # bootstrap samples that are averaged over, always the same ones
+BINS = 201  # bins of width 0.01 1/m, centred at the multiples of 0.01 in [-1, 1]
+
+
+def curvature_histogram(curvature: NDArray[Any]) -> NDArray[np.int64]:
+    """Counts [201] of average curvatures [...] in 1/m; values beyond +-1 fall into the outermost bins."""
+    half = BINS // 2
+    flat = np.asarray(curvature, dtype=np.float64).reshape(-1).clip(-1, 1)
+    return np.bincount(np.rint(flat * half).astype(np.int64) + half, minlength=BINS)
+
+
+def jensen_shannon(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.float64]:
+    """Jensen-Shannon divergence [...] of histograms [..., K], in nats (0 to ln 2); NaN where either is empty.
+
+    It is the divergence itself, not its square root.
+    """
+    p, q = (_normalised(np.asarray(counts, dtype=np.float64)) for counts in (first, second))
+    middle = (p + q) / 2
+    divergence = (_relative(p, middle) + _relative(q, middle)) / 2
+    return np.maximum(divergence, 0.0)
+
+
+class Divergence(NamedTuple):
+    """A divergence between what rollouts and logs chose, and what is left of it without sampling."""
+
+    value: float  # of the summed histograms, nats
+    error: float  # standard error (jackknife); NaN for a single sample
+    corrected: float  # the value less the bias that finite samples give it; NaN for a single sample
+    parts: NDArray[np.float64]  # [n] pseudo-values of the samples, whose mean is the corrected value
+
+
+def sampled_divergence(counts: NDArray[Any], counts_log: NDArray[Any]) -> Divergence:
+    """Jensen-Shannon divergence of the sums of n independent samples, its error and bias by leaving one out.
+
+    Samples are drawn as pairs: of segments that are alike in rollouts and log less is sampling than of others, and
+    rollouts that are alike count as what they are.
+
+    Takes the histograms [n, K] of rollouts and log of each sample (a recording, or a segment). Source: Quenouille,
+    "Notes on bias in estimation", Biometrika 43 (1956).
+    """
+    total, total_log, number = counts.sum(0), counts_log.sum(0), len(counts)
+    value = float(jensen_shannon(total, total_log))
+    if number < 2:
+        return Divergence(value, math.nan, math.nan, np.full(number, math.nan))
+    without = jensen_shannon(total - counts, total_log - counts_log)
+    parts = number * value - (number - 1) * without
+    error = float(parts.std(ddof=1) / np.sqrt(number))
+    return Divergence(value, error, float(parts.mean()), parts)
+
+
+def sampling_floor(counts_log: NDArray[Any]) -> float:
+    """What a log of this size scores against the distribution that it is a sample of, nats.
+
+    No policy is known to be better, however many rollouts it has. It is estimated by bootstrap samples of the
+    segments, of which it takes the log's histograms [n, K], against all of them. Two logs of this size differ by
+    about twice as much. It is too low where segments of one recording are alike, or many turns are so rare that the
+    log has none.
+    """
+    number = len(counts_log)
+    often = np.random.default_rng(0).multinomial(number, np.full(number, 1 / number), size=DRAWS)
+    values = jensen_shannon(often @ counts_log, counts_log.sum(0)[None])
+    known = values[np.isfinite(values)]  # a draw without any curvature has no distribution
+    return float(known.mean()) if len(known) else math.nan
+
+
+def _normalised(counts: NDArray[np.float64]) -> NDArray[np.float64]:
+    total = counts.sum(-1, keepdims=True)
+    return np.where(total > 0, counts / np.where(total > 0, total, 1.0), np.nan)
+
+
+def _relative(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum of p ln(p / q) over the bins where p is not 0; NaN stays NaN."""
+    none = p == 0
+    return (p * np.log(np.where(none, 1.0, p) / np.where(none, 1.0, q))).sum(-1)
+
+
+WIDTH, FASTEST = 0.5, 45.0  # bins of speeds, and the last of them, in m/s
 _SPEEDS = round(FASTEST / WIDTH)
 _SHARES = (
     "collision_rate",
@@ -52,27 +120,17 @@ _ROW = (
 
 @dataclass(frozen=True)
 class SegmentResult:
-    """What one run segment adds to the table.
+    """What one run segment adds to the table."""
 
-    Attributes:
-        group: the recording it is part of.
-        rollouts: K.
-        sums: of every number that is a ratio of sums over segments, what the segment adds to the two sums.
-        ade: its own ADE, metres; NaN where the log is valid at no step.
-        histogram: [201] curvatures of the branching regions visited by the rollouts.
-        histogram_log: [201] curvatures of those visited by the log.
-        speeds: [bins, 2] agent-steps by speed, simulated and logged.
-        choice: what the search made of the goals; None without search or goals.
-    """
-
-    group: str
-    rollouts: int
+    group: str  # the recording it is part of
+    rollouts: int  # K
+    # of every number that is a ratio of sums over segments, what the segment adds to the two sums
     sums: dict[str, tuple[float, float]]
-    ade: float
-    histogram: NDArray[np.int64]
-    histogram_log: NDArray[np.int64]
-    speeds: NDArray[np.int64]
-    choice: Choice | None
+    ade: float  # its own ADE, metres; NaN where the log is valid at no step
+    histogram: NDArray[np.int64]  # [201] curvatures of the branching regions visited by the rollouts
+    histogram_log: NDArray[np.int64]  # [201] curvatures of those visited by the log
+    speeds: NDArray[np.int64]  # [bins, 2] agent-steps by speed, simulated and logged
+    choice: Choice | None  # what the search made of the goals; None without search or goals
 
 
 class RolloutMetrics:
@@ -125,8 +183,7 @@ class RolloutMetrics:
             curvature_log: per segment, the same of those visited by the log.
             choices: [B] what the search made of the goals; None without search or goals.
 
-        Raises:
-            ValueError: for a segment that was added before.
+        Raises ValueError for a segment that was added before.
         """
         # Sums are exact, so that padding among what is summed does not change how they are rounded.
         away = displacement.double().masked_fill(~(simulated & logged[:, None]), 0.0).flatten(2).tolist()
@@ -177,11 +234,7 @@ class RolloutMetrics:
             )
 
     def merge(self, other: RolloutMetrics) -> None:
-        """Add all that another process or batch has seen.
-
-        Raises:
-            ValueError: if both have seen the same segment.
-        """
+        """Add all that another process or batch has seen. Raises ValueError if both have seen the same segment."""
         twice = self.segments.keys() & other.segments.keys()
         if twice:
             raise ValueError(f"segments {sorted(twice)[:3]} were added twice")

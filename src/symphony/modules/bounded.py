@@ -11,16 +11,30 @@ from torch import Tensor
 from torch.distributions import Distribution, Normal, constraints
 
 from symphony.geometry.frames import constant
-from symphony.modules.policy import inverse_cdf
 
-SMOOTH = 0.02
-"""Metres within which a displacement bends smoothly towards zero instead of turning negative."""
+SMOOTH = 0.02  # metres within which a displacement bends smoothly towards zero instead of turning negative
 INSIDE = 0.95
 """Share of the bounds beyond which an action counts as lying there, so that its likelihood stays finite."""
-LEAST = 1e-3
-"""Metres below which a histogram takes all displacements for standing still."""
-EDGE = 1e-6
-"""How near to an end of its cell a draw may come, as a share of the cell."""
+LEAST = 1e-3  # metres below which a histogram takes all displacements for standing still
+EDGE = 1e-6  # how near to an end of its cell a draw may come, as a share of the cell
+
+
+def inverse_cdf(logits: Float[Tensor, "*b C"], noise: Float[Tensor, "*b"]) -> Int[Tensor, "*b"]:
+    """Draw categories `[...]` int64 from logits `[..., C]` by uniform numbers `[...]` in [0, 1].
+
+    The category is the one whose interval of the cumulative distribution holds the number; a category of
+    probability zero is never drawn. Where there is no category at all it is 0.
+    """
+    if logits.shape[-1] == 0:
+        return torch.zeros_like(noise, dtype=torch.int64)
+    cumulative = torch.softmax(logits.detach(), -1).cumsum(-1)
+    total = cumulative[..., -1:].contiguous()
+    # It never falls, so a place in it is the number of elements at most, or less than, a value.
+    drawn = torch.searchsorted(cumulative, noise[..., None] * total, right=True)
+    # Rounding may carry the product up to the total, past the last category that is possible at all. Where logits are
+    # not numbers no place is right, but one must be named.
+    last = torch.searchsorted(cumulative, total).clamp_max(logits.shape[-1] - 1)
+    return torch.minimum(drawn, last).squeeze(-1)
 
 
 def squash(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
@@ -75,12 +89,7 @@ class BoundedDisplacement(Distribution):
     Their shares of what can be reached are those of Gaussian numbers u, squashed; differentiable in u, in the
     parameters and in the bounds.
 
-    Args:
-        loc: [..., 2] mean of u.
-        scale: [..., 2] standard deviation of u.
-        pace: [...] metres covered at unchanged speed.
-        slope: [...] largest ratio of left to forward.
-        reach: metres that the largest acceleration adds.
+    ``loc`` and ``scale`` are mean and standard deviation of u; the others are as :func:`displaced` has them.
     """
 
     arg_constraints = {}  # noqa: RUF012 - the type torch declares
@@ -167,14 +176,8 @@ class DisplacementHistogram(Distribution):
     of F x L cells.
 
     Unlike one Gaussian it can brake or go on, turn left or right, and not do what lies between. A draw has the
-    gradient of the mean over all cells (straight through).
-
-    Args:
-        logits: [..., F * L] of the cells, those of the hardest braking first.
-        pace: [...] metres covered at unchanged speed.
-        slope: [...] largest ratio of left to forward.
-        reach: metres that the largest acceleration adds.
-        forward: F, cells between the hardest braking and the largest acceleration.
+    gradient of the mean over all cells (straight through). Logits [..., F * L] are of the cells, those of the hardest
+    braking first; ``forward`` is F, between the hardest braking and the largest acceleration.
     """
 
     arg_constraints = {}  # noqa: RUF012 - the type torch declares

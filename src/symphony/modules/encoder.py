@@ -23,21 +23,14 @@ FORESIGHT = (0.5, 1.0, 2.0)
 
 @dataclass(frozen=True)
 class ElementGroup:
-    """One type of element that an agent observes (objects, road points, a route): an encoder and a pool of its own.
+    """A type of element that an agent observes (objects, road points, a route): an encoder and a pool of its own."""
 
-    Attributes:
-        key: float `[..., N, K, features]`; K may differ from call to call.
-        mask_key: bool `[..., N, K]`, True where an element is valid.
-        features: features of one element, those under further keys included.
-        more_keys: further features `[..., N, K, F]` of the same elements.
-        gap_keys: signed gaps `[..., N, K]` or `[..., N, K, H]` to them in metres, of which :func:`gap_features` makes
-            three features each.
-    """
-
-    key: NestedKey
-    mask_key: NestedKey
-    features: int
-    more_keys: tuple[NestedKey, ...] = ()
+    key: NestedKey  # float `[..., N, K, features]`; K may differ from call to call
+    mask_key: NestedKey  # bool `[..., N, K]`, True where an element is valid
+    features: int  # features of one element, those under further keys included
+    more_keys: tuple[NestedKey, ...] = ()  # further features `[..., N, K, F]` of the same elements
+    # signed gaps `[..., N, K]` or `[..., N, K, H]` to them in metres, of which :func:`gap_features` makes
+    # three features each
     gap_keys: tuple[NestedKey, ...] = ()
 
 
@@ -71,14 +64,8 @@ class SceneEncoder(nn.Module):
 
     Masked elements, padded agents (`valid` False: all their inputs count as absent) and the other agents of
     the batch have no influence on an agent's vector. Features should come scaled to order one.
-
-    Args:
-        own_features: features of the agent itself.
-        group_features: features of one element, per group.
-        hidden: width of every encoder.
-
-    Attributes:
-        width: size D of the vector, `hidden * (1 + number of groups)`.
+    Takes how many features the agent itself has, and one element of each group; ``hidden`` is the width of every
+    encoder, ``width`` the size D of the vector, `hidden * (1 + number of groups)`.
     """
 
     def __init__(self, own_features: int, group_features: Sequence[int], *, hidden: int = 64) -> None:
@@ -108,10 +95,8 @@ class SceneEncoder(nn.Module):
 class SceneNetwork(nn.Module):
     """A :class:`SceneEncoder` and an MLP head on its vector, giving `[..., N, outputs]`.
 
-    Args:
-        encoder: the encoder; not shared with another network unless the same object is passed to both.
-        outputs: size of the result.
-        head: widths of the head's hidden layers.
+    The encoder is not shared with another network unless the same object is passed to both; ``head`` is the widths of
+    the head's hidden layers.
     """
 
     def __init__(self, encoder: SceneEncoder, outputs: int, *, head: Sequence[int] = (128, 128)) -> None:

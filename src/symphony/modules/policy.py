@@ -1,4 +1,4 @@
-"""Policies over discrete actions, random numbers as a function of what they are for, and draws decided by them."""
+"""Policies over actions and goals, random numbers as a function of what they are for, and draws decided by them."""
 
 from __future__ import annotations
 
@@ -6,49 +6,220 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     InteractionType,
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
+    TensorDictModule,
     TensorDictModuleBase,
 )
 from tensordict.nn.probabilistic import interaction_type
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution
 
-from symphony.keys import ACTION, LOG_PROB, LOGITS, NOISE, OWN, STEP, STREAM, VALID
-from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, SceneNetwork, scene_module
+from symphony.geometry.nearest import on_host
+from symphony.keys import (
+    ACTION,
+    GOAL,
+    GOAL_LOGITS,
+    GOAL_NOISE,
+    LOG_PROB,
+    LOGITS,
+    NOISE,
+    OWN,
+    ROUTES,
+    ROUTES_MASK,
+    STATE,
+    STEP,
+    STREAM,
+    VALID,
+)
+from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram, inverse_cdf, positive
+from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, SceneNetwork, mlp, scene_module
 from symphony.streams import fold_in, uniform
 
+NO_ROUTE = -1e4
+"""Logit of a route that does not exist; finite, so that an agent without any still has a distribution."""
 
-def inverse_cdf(logits: Float[Tensor, "*b C"], noise: Float[Tensor, "*b"]) -> Int[Tensor, "*b"]:
-    """Draw categories `[...]` int64 from logits `[..., C]` by uniform numbers `[...]` in [0, 1].
 
-    The category is the one whose interval of the cumulative distribution holds the number; a category of
-    probability zero is never drawn. Where there is no category at all it is 0.
+class RouteScores(nn.Module):
+    """Logits `[..., N, G]` of routes from their geometry and the scene around the agent.
+
+    Routes are scored one by one, so their order and number make no difference. ``route_features`` are those of one
+    route, ``hidden`` is the width of the route encoder and of the layer where both meet.
     """
-    if logits.shape[-1] == 0:
-        return torch.zeros_like(noise, dtype=torch.int64)
-    cumulative = torch.softmax(logits.detach(), -1).cumsum(-1)
-    total = cumulative[..., -1:].contiguous()
-    # It never falls, so a place in it is the number of elements at most, or less than, a value.
-    drawn = torch.searchsorted(cumulative, noise[..., None] * total, right=True)
-    # Rounding may carry the product up to the total, past the last category that is possible at all. Where logits are
-    # not numbers no place is right, but one must be named.
-    last = torch.searchsorted(cumulative, total).clamp_max(logits.shape[-1] - 1)
-    return torch.minimum(drawn, last).squeeze(-1)
+
+    def __init__(self, encoder: SceneEncoder, route_features: int, *, hidden: int = 64) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.route = mlp((route_features, hidden, hidden))
+        self.scene = nn.Linear(encoder.width, hidden)
+        self.head = mlp((hidden, hidden, 1))
+
+    def forward(
+        self, own: Float[Tensor, "*b N F"], valid: Bool[Tensor, "*b N"], *inputs: Shaped[Tensor, "*_"]
+    ) -> Float[Tensor, "*b N G"]:
+        """Inputs as for :class:`SceneEncoder`, then routes `[..., N, G, F]` and their mask `[..., N, G]`."""
+        *elements, routes, mask = inputs
+        around = self.scene(self.encoder(own, valid, *elements))
+        if not on_host(mask):
+            # Nothing of a route that is padding gets through, whatever its features hold.
+            routes = torch.where(mask[..., None], routes, 0.0)
+            return torch.where(mask & valid[..., None], self._scores(routes, around[..., None, :]), NO_ROUTE)
+        # Most are padding, as some agents have ten times as many routes as others.
+        place = (mask & valid[..., None]).flatten().nonzero().squeeze(-1)
+        met = around.reshape(-1, around.shape[-1]).index_select(0, place // mask.shape[-1])
+        found = self._scores(routes.reshape(-1, routes.shape[-1]).index_select(0, place), met)
+        return found.new_full((mask.numel(),), NO_ROUTE).index_copy(0, place, found).view(mask.shape)
+
+    def _scores(self, routes: Float[Tensor, "*b F"], around: Float[Tensor, "*#b H"]) -> Float[Tensor, "*b"]:
+        met = torch.relu(self.route(routes) + around)
+        return self.head(met).squeeze(-1)
+
+
+def goal_policy(
+    own_features: int,
+    groups: Sequence[ElementGroup],
+    route_features: int,
+    *,
+    hidden: int = 64,
+    own_keys: Sequence[NestedKey] = (OWN,),
+    valid_key: NestedKey = VALID,
+    encoder: EncoderClass = SceneEncoder,
+) -> ProbabilisticTensorDictSequential:
+    """A categorical over each agent's feasible routes, given the first state: h(g | s_1).
+
+    Writes logits `[..., N, G]` and goals `[..., N]` int64 (meaningless for agents without a route: see
+    :func:`drawn_goals`). A uniform number under `GOAL_NOISE`, if there is one, decides the draw. Another `encoder`
+    takes the arguments of :class:`SceneEncoder`.
+    """
+    encoding = encoder(own_features, [group.features for group in groups], hidden=hidden)
+    network = RouteScores(encoding, route_features, hidden=hidden)
+    return ProbabilisticTensorDictSequential(
+        scene_module(
+            network,
+            groups,
+            GOAL_LOGITS,
+            own_keys=own_keys,
+            valid_key=valid_key,
+            more_keys=(ROUTES, ROUTES_MASK),
+        ),
+        NoiseSampler(GOAL_LOGITS, GOAL, noise_key=GOAL_NOISE),
+    )
+
+
+def drawn_goals(goal: Int[Tensor, "*b N"], mask: Bool[Tensor, "*b N G"]) -> Int[Tensor, "*b N"]:
+    """Goals `[..., N]` with -1 for agents that have no route in `mask` `[..., N, G]`."""
+    return torch.where(mask.any(-1), goal, -1)
+
+
+ACCELERATION, LATERAL = 4.0, 6.0
+"""Largest accelerations in m/s^2, along and across; the second bounds the ratio of left to forward at speed."""
+SLOPE, LEAST_SCALE = 0.3, 0.05
+"""Largest ratio of left to forward at low speed, and smallest standard deviation of the Gaussian numbers."""
+AXLE = 0.3  # distance from box centre to rear axle, as a share of the length
+
+
+class _Parameters(nn.Module):
+    """From the head's numbers, states [..., N, 4], own features and mask to the parameters.
+
+    The numbers are the logits of cells [..., N, C], or the mean and the raw width of a Gaussian [..., N, 4].
+    Padded agents, whose states may be anything, count as standing.
+    """
+
+    def __init__(self, cells: int, dt: float, size_scale: float) -> None:
+        super().__init__()
+        self.cells, self.dt, self.size_scale = cells, dt, size_scale
+
+    def forward(
+        self,
+        head: Float[Tensor, "*b N H"],
+        state: Float[Tensor, "*b N 4"],
+        own: Float[Tensor, "*b N F"],
+        valid: Bool[Tensor, "*b N"],
+    ) -> tuple[Float[Tensor, "*_"], ...]:
+        speed = torch.where(valid, state[..., 3], 0.0).clamp_min(0.0)
+        # On a curve of curvature k the centre moves at an angle whose sine is k times its distance to the rear
+        # axle; k v^2 is the lateral acceleration.
+        arm = AXLE * self.size_scale * torch.where(valid, own[..., 1], 0.0)
+        fast = speed.square() * SLOPE / (LATERAL * arm.clamp_min(0.1))
+        bounds = speed * self.dt, SLOPE / (1.0 + fast.square()).sqrt()
+        if self.cells:
+            return head, *bounds
+        return head[..., :2], LEAST_SCALE + positive(head[..., 2:], 1.0), *bounds
+
+
+def displacement_policy(
+    own_features: int,
+    groups: Sequence[ElementGroup],
+    *,
+    hidden: int = 64,
+    head: Sequence[int] = (128, 128),
+    cells: int = 0,
+    dt: float,
+    size_scale: float = 5.0,
+    own_keys: Sequence[NestedKey] = (OWN,),
+    valid_key: NestedKey = VALID,
+    state_key: NestedKey = STATE,
+    action_key: NestedKey = ACTION,
+    noise_key: NestedKey = NOISE,
+    encoder: EncoderClass = SceneEncoder,
+) -> ProbabilisticTensorDictSequential:
+    """Encoder, head and a :class:`BoundedDisplacement` (the action space the paper gives to MGAIL, section V-A), or a
+    :class:`DisplacementHistogram` in its place.
+
+    Weights follow `torch.manual_seed`. Writes actions `[..., N, 2]` in metres, sampled with gradient
+    (reparameterised) according to TorchRL's exploration type; a pair of uniform numbers under `noise_key` decides
+    them where there is one (see :class:`NoiseSampler`).
+
+    Args:
+        own_features: features under all `own_keys` together; the second of the first key is the box length.
+        groups: types of elements.
+        hidden: width of the encoders.
+        head: widths of the head's hidden layers.
+        cells: of the histogram, along and across; 0 for a Gaussian.
+        dt: seconds per step.
+        size_scale: metres of box length that the own feature counts as 1.
+        own_keys: features of the agent itself, concatenated.
+        valid_key: mask of the agents.
+        state_key: `[..., N, 4]`, of which the speed is read.
+        action_key: written.
+        noise_key: `[..., N, 2]`, optional in the TensorDict.
+        encoder: a class with the arguments of :class:`SceneEncoder`.
+    """
+    if cells and (cells < 3 or cells % 2 == 0):
+        raise ValueError(f"cells must be odd and at least 3, or 0 for none, is {cells}")
+    if not dt > 0.0:
+        raise ValueError(f"dt must be positive, is {dt}")
+    encoding = encoder(own_features, [group.features for group in groups], hidden=hidden)
+    network = SceneNetwork(encoding, cells**2 or 4, head=head)
+    names = ("logits", "pace", "slope") if cells else ("loc", "scale", "pace", "slope")
+    parameters: list[NestedKey] = [("agents", name) for name in names]
+    kind: dict[str, Any] = {"forward": cells} if cells else {}
+    return ProbabilisticTensorDictSequential(
+        scene_module(network, groups, ("agents", "head"), own_keys=own_keys, valid_key=valid_key),
+        TensorDictModule(
+            _Parameters(cells, dt, size_scale),
+            in_keys=[("agents", "head"), state_key, own_keys[0], valid_key],
+            out_keys=parameters,
+        ),
+        NoiseSampler(
+            dict(zip(names, parameters, strict=True)),
+            action_key,
+            noise_key=noise_key,
+            distribution_class=DisplacementHistogram if cells else BoundedDisplacement,
+            distribution_kwargs={"reach": ACCELERATION * dt**2, **kind},
+        ),
+    )
 
 
 class SeededNoise(TensorDictModuleBase):
     """Gives every agent the random number its next action is decided by.
 
     It depends on the seed, the rollout's identity, the step and the agent's place alone (never on the batch).
-
-    Args:
-        seed: of all rollouts.
-        numbers: per agent; 0 for a single one without a dimension of its own.
+    There are ``numbers`` of them per agent; 0 stands for a single one without a dimension of its own.
     """
 
     in_keys = [STREAM, STEP, VALID]  # noqa: RUF012 - the type TensorDictModuleBase declares

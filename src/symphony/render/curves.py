@@ -157,9 +157,7 @@ def plot_curvature(
         path: file to write (png, pdf or svg).
         columns: panels per row, at most.
 
-    Raises:
-        DataError: no region was visited, or counts differ in their number of bins.
-        ConfigError: a file of another kind.
+    Raises a :class:`DataError` where no region was visited, or counts differ in their number of bins.
     """
     file = picture_path(path)
     for title, pair in panels.items():

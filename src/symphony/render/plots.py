@@ -18,8 +18,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from symphony.data.segment import AgentType, RunSegment
-from symphony.render.agents import CORNERS, draw_boxes, draw_trails, pieces, place
-from symphony.render.roads import draw_roads, draw_signals
+from symphony.render.roads import CORNERS, draw_boxes, draw_roads, draw_signals, draw_trails, pieces, place
 from symphony.render.style import (
     INK,
     PLAYBACK,
@@ -42,8 +41,7 @@ if TYPE_CHECKING:
 LOG_DASHES = (0, (4, 2))
 ROUTE = "#C2410C"
 """Colour of the route that the log took."""
-ENTRIES = 8
-"""Agents that a legend names; a crowd's would hide the picture."""
+ENTRIES = 8  # agents that a legend names; a crowd's would hide the picture
 EVENTS = (("collision", "collision", "X"), ("offroad", "off road", "^"))
 
 
@@ -66,8 +64,7 @@ def plot_segment(
         view: limits in metres; by default around the trails of the agents in colour, on given axes a square.
         title: by default the segment's id.
 
-    Raises:
-        ConfigError: a file of another kind.
+    Raises a :class:`ConfigError` for a file of another kind.
     """
     step = segment.current_step if step is None else step
     named = segment.interest.tolist() if interactive is None else interactive
@@ -177,13 +174,7 @@ def plot_rollout(clip: Clip, target: Target) -> Axes:
     """Draw rollouts of the interactive agents over the log, with boxes where they end.
 
     Playback agents, and the lights, are shown as logged at the last step; those that were hit also where that was.
-
-    Args:
-        clip: the rollouts.
-        target: file to write (png, pdf or svg) or axes to draw on.
-
-    Raises:
-        ConfigError: a file of another kind.
+    The target is a file (png, pdf or svg; a :class:`ConfigError` for another) or axes to draw on.
     """
     segment, last, trails = clip.segment, clip.steps.stop - 1, clip.points
     view = clip.view or _own_view(trails, target)
@@ -215,30 +206,19 @@ def plot_rollout(clip: Clip, target: Target) -> Axes:
 
 
 def plot_routes(
-    segment: RunSegment,
-    agent: int,
-    lines: Sequence[NDArray[Any]],
-    logged: int,
-    target: Target,
-    *,
-    step: int = 0,
+    segment: RunSegment, agent: int, lines: Sequence[NDArray[Any]], logged: int, target: Target
 ) -> Axes:
     """Draw the routes of an agent, a dot for each of their points, the one that it took on top, and its log.
 
-    Args:
-        segment: the run segment.
-        agent: row of it.
-        lines: points [P, 2] of the routes.
-        logged: which of them it took, -1 for none.
-        target: file to write (png, pdf or svg) or axes to draw on.
-        step: at which boxes are shown.
+    Takes the agent's row of the segment, the points [P, 2] of its routes, and which of them it took, -1 for none.
+    Boxes are those of the first step. The target is a file (png, pdf or svg) or axes to draw on.
     """
     path = segment.position[agent, :, :2][segment.valid[agent]]
     places = np.concatenate([path, *lines])
     view = _own_view(places, target)
     axes, file = open_target(target, view)
     entries = draw_roads(axes, segment.road, view)
-    draw_playback(axes, segment, step, np.setdiff1d(np.arange(segment.num_agents), [agent]))
+    draw_playback(axes, segment, 0, np.setdiff1d(np.arange(segment.num_agents), [agent]))
     style: dict[str, Any] = {"marker": ".", "markersize": 2.2, "solid_capstyle": "butt"}
     own = colors_of(segment, np.array([segment.ego]))[0]
     for number, line in enumerate(lines):
@@ -250,8 +230,8 @@ def plot_routes(
         shown.append(Line2D([], [], color=ROUTE, linewidth=1.6, marker=".", label="the one that was taken"))
     axes.plot(*path.T, color=INK, linestyle=LOG_DASHES, linewidth=1.1, zorder=9.5)
     shown.append(Line2D([], [], color=INK, linestyle=LOG_DASHES, linewidth=1.1, label="log"))
-    if segment.valid[agent, step]:
-        box = segment.position[[agent], step, :2], segment.heading[[agent], step], segment.size[[agent]]
+    if segment.valid[agent, 0]:
+        box = segment.position[[agent], 0, :2], segment.heading[[agent], 0], segment.size[[agent]]
         draw_boxes(axes, *box, own, gid=f"box-{agent}")
     frame(axes, view, f"{segment.segment_id}, agent {segment.agent_id[agent]}", describe(segment))
     add_legend(axes, [*shown, *entries], places)
@@ -263,17 +243,10 @@ def plot_routes(
 def plot_grid(
     panels: Sequence[Callable[[Axes], Any]], path: str | Path, *, columns: int = 3, size: float = 4.5
 ) -> Figure:
-    """Several pictures in one file.
+    """Several pictures in one file (png, pdf or svg; a :class:`ConfigError` for another).
 
-    Args:
-        panels: functions that draw on the axes they are given, such as
-            ``lambda axes: plot_segment(segment, axes)``.
-        path: file to write (png, pdf or svg).
-        columns: pictures per row, at most.
-        size: inches a picture is wide and high.
-
-    Raises:
-        ConfigError: a file of another kind.
+    Panels are functions that draw on the axes they are given, such as ``lambda axes: plot_segment(segment, axes)``,
+    on so many inches; there are at most ``columns`` in a row.
     """
     file = picture_path(path)
     columns = min(columns, len(panels))
@@ -324,11 +297,7 @@ def draw_events(
 
 
 def draw_hit(axes: Axes, clip: Clip) -> Patch | None:
-    """Outline the playback agents that were hit, where they were when it began.
-
-    Returns:
-        Legend entry, None where nobody was hit.
-    """
+    """Outline the playback agents that were hit, where they were when it began; gives a legend entry if any."""
     segment = clip.segment
     found: set[tuple[int, int]] = set()
     for rollout, rank, at in np.argwhere(clip.beginnings("collision")).tolist():

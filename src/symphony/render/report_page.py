@@ -7,7 +7,7 @@ from html import escape
 from typing import Any
 from urllib.parse import urlencode
 
-from symphony.render.viewer.page import filled, script_json, template
+from symphony.render.viewer.pack import filled, script_json, template
 
 TILES = {
     "collision_rate": ("collisions", "% of runs"),
@@ -52,16 +52,12 @@ EVENTS = {
     "blocking_time": "blocks traffic",
 }
 """What is said of a run where a number is not 0."""
-LEAD = 2.0
-"""Seconds before the first event of a run at which its replay begins."""
+LEAD = 2.0  # seconds before the first event of a run at which its replay begins
 
 
 def report_page(found: Mapping[str, Any], viewer: str | None = "view.html") -> str:
-    """One self-contained page.
-
-    Args:
-        found: ``agent``, ``evaluated``, the totals, ``collisions`` and ``per_run``, as the report writes them.
-        viewer: address of the page that plays the rollouts, relative to this one; None for none.
+    """One self-contained page of what the report writes; ``viewer`` is the address of the page that plays the
+    rollouts, relative to this one, None for none.
     """
     runs = found["per_run"]
     parts = {

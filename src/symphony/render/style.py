@@ -31,8 +31,7 @@ FORMATS, ANIMATIONS, FILMS = ("png", "pdf", "svg"), ("gif",), ("mp4",)
 
 Corner = Literal["upper right", "upper left", "lower right"]
 Target = str | Path | Axes
-View = tuple[float, float, float, float]
-"""x from, x to, y from, y to, in metres."""
+View = tuple[float, float, float, float]  # x from, x to, y from, y to, in metres
 
 
 def agent_color(rank: int) -> str:

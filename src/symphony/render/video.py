@@ -22,9 +22,8 @@ from PIL import Image
 from symphony.errors import ConfigError
 from symphony.files import replacing
 from symphony.render import plots
-from symphony.render.agents import CORNERS, draw_boxes, place
 from symphony.render.plots import Clip
-from symphony.render.roads import draw_roads, draw_signals
+from symphony.render.roads import CORNERS, draw_boxes, draw_roads, draw_signals, place
 from symphony.render.style import (
     ANIMATIONS,
     FILMS,
@@ -39,47 +38,34 @@ from symphony.render.style import (
     with_aspect,
 )
 
-SMOOTH = 25
-"""Frames a second of a film that a player is sure to keep up with; slower clips repeat frames."""
-FRAMES = 51
-"""Frames of an animation, at most; steps are left out evenly where there are more."""
-HEAD = 0.45
-"""Inches for the title of a panel."""
-COLORS = 255
-"""Colours of an animation: one less than the format has, which then marks what stays as it was."""
+SMOOTH = 25  # frames a second of a film that a player is sure to keep up with; slower clips repeat frames
+FRAMES = 51  # frames of an animation, at most; steps are left out evenly where there are more
+FILM = 5.0  # inches a panel of a film is wide
+HEAD = 0.45  # inches for the title of a panel
+COLORS = 255  # colours of an animation: one less than the format has, which then marks what stays as it was
 
 
 def draw_clips(clips: Sequence[Clip], path: Path, columns: int = 3) -> None:
-    """Draw, animate or film rollouts beside the log.
+    """Draw, animate (to a .gif) or film (to a .mp4) rollouts beside the log, at most ``columns`` panels in a row.
 
-    Args:
-        clips: rollouts of one run segment each.
-        path: file to write: an animation if it ends in .gif, a film if it ends in .mp4, else a picture.
-        columns: panels per row, at most.
-
-    Raises:
-        ConfigError: a file of another kind, or the encoder of films is not installed.
+    Raises a :class:`ConfigError` for a file of another kind, or where the encoder of films is not installed.
     """
     kind = picture_path(path, (*FORMATS, *ANIMATIONS, *FILMS)).suffix[1:].lower()
     if kind in FILMS:
-        write_film(clips, path, columns=columns)
+        write_film(clips, path, columns)
     elif kind in ANIMATIONS:
         animate_rollouts(clips, path, columns=columns)
     else:
         plots.plot_grid([partial(plots.plot_rollout, clip) for clip in clips], path, columns=columns)
 
 
-def write_film(clips: Sequence[Clip], path: Path, *, columns: int = 3, size: float = 5.0) -> None:
-    """What :func:`animate_rollouts` draws, as a film (H.264).
-
-    Raises:
-        ConfigError: the encoder is not installed.
-    """
+def write_film(clips: Sequence[Clip], path: Path, columns: int) -> None:
+    """What :func:`animate_rollouts` draws, as a film (H.264)."""
     try:
         import imageio_ffmpeg  # noqa: PLC0415 - an extra
     except ImportError as error:
         raise ConfigError("a film needs an encoder: pip install 'symphony-traffic[video]'") from error
-    frames, interval = frames_of(clips, columns=columns, size=size)
+    frames, interval = frames_of(clips, columns=columns, size=FILM)
     # The format wants even sides.
     height, width = (side - side % 2 for side in frames[0].shape[:2])
     repeat = max(1, round(SMOOTH * interval))
@@ -99,16 +85,9 @@ def animate_rollouts(clips: Sequence[Clip], path: str | Path, *, columns: int = 
 
     Interactive agents are drawn where they are in every rollout, with the way they came; dashed is their way in the
     log, outlined where they were then. Playback agents and lights are shown as logged. The last frame is the last
-    step; shorter segments end earlier and stay as they are. Where nothing moves all frames are the same.
-
-    Args:
-        clips: rollouts of each segment.
-        path: file to write (gif).
-        columns: panels per row, at most.
-        size: inches a panel is wide, and high at most.
-
-    Raises:
-        ConfigError: a file of another kind.
+    step; shorter segments end earlier and stay as they are. Where nothing moves all frames are the same. Panels are
+    at most ``size`` inches wide and high, and ``columns`` in a row. Raises a :class:`ConfigError` for a file that is
+    no .gif.
     """
     file = picture_path(path, ANIMATIONS)
     frames, interval = frames_of(clips, columns=columns, size=size)

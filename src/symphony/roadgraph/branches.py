@@ -1,8 +1,9 @@
-"""Which branching regions a trajectory visits: the raw material of the curvature JSD (section V of the paper)."""
+"""Which lane a vehicle is on, and which branching regions a trajectory visits (for the curvature JSD, section V)."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,95 @@ import shapely
 from numpy.typing import NDArray
 
 from symphony.geometry.nearest import spans
-from symphony.roadgraph.graph import Bools, Indices, LaneGraph, Reals, turn_between
+from symphony.roadgraph.graph import Bools, Indices, LaneGraph, Near, Reals, turn_between
 
-REACH = 2.0
-"""Metres from a region's centre line, or from its entry point, within which a trajectory is on it."""
-APART = 0.5
-"""Metres by which every alternative must be farther away before a region counts as chosen."""
-TURN = math.pi / 4
-"""Largest angle between a vehicle on a region and the region."""
+LATERAL = 3.0  # metres from a centre line within which a vehicle can be on a lane
+LANE_TURN = math.pi / 3  # largest angle between a vehicle and its lane
+MARGIN = 1.5
+"""Metres by which a lane may be farther away than the nearest and is still one that a vehicle may be on."""
+_TIE = 0.25  # metres by which distances must differ to decide between lanes before the heading does
+_TURN_TIE = 1e-3
+
+
+def lane_of(
+    graph: LaneGraph,
+    position: NDArray[Any],
+    heading: NDArray[Any],
+    *,
+    tolerance: float = LATERAL,
+    keep: Callable[[Near], Bools] | None = None,
+) -> Indices:
+    """Lane of each vehicle, -1 where there is none.
+
+    It is the nearest centre line that points the same way within :data:`LANE_TURN`. Lanes within a quarter of a
+    metre of the nearest are told apart by heading, then by index.
+
+    Takes positions [..., 2] and headings [...], the largest distance from the centre line in metres, and what says
+    which of some pairs of a vehicle and a lane near to it count, where not all do. Raises ValueError for a position
+    or heading that is not finite; names the vehicle.
+    """
+    position = np.asarray(position, dtype=np.float64)
+    wrong = np.argwhere(~(np.isfinite(position).all(-1) & np.isfinite(heading)))
+    if len(wrong):
+        raise ValueError(f"vehicle {wrong[0].tolist()}: a position or heading that is not finite")
+    near, turn = _compatible(graph, position.reshape(-1, 2), np.reshape(heading, -1), tolerance)
+    if keep is not None:
+        near, turn = near.only(kept := keep(near)), turn[kept]
+    return _nearest(graph, near, turn, position[..., 0].size).reshape(position.shape[:-1])
+
+
+def starting_lanes(graph: LaneGraph, position: NDArray[Any], heading: float) -> list[tuple[int, float]]:
+    """Every lane one vehicle may be on: inside a junction, where lanes overlap, usually several.
+
+    These are lanes at most :data:`MARGIN` metres farther away than the nearest one. Of a lane and its successor only
+    the one that the vehicle is alongside is kept. The lane that :func:`lane_of` names comes first, then by distance.
+    Pairs are (lane, metres from its start). Raises ValueError for a position or heading that is not finite.
+    """
+    position = np.asarray(position, dtype=np.float64).reshape(1, 2)
+    if not (np.isfinite(position).all() and np.isfinite(heading)):
+        raise ValueError("a position or heading that is not finite")
+    near, turn = _compatible(graph, position, np.array([heading]), LATERAL)
+    if len(near.line) == 0:
+        return []
+    best = int(_nearest(graph, near, turn, 1)[0])
+    found = {
+        int(graph.usable_lanes[k]): (float(distance), float(along))
+        for k, distance, along in zip(near.line, near.distance, near.along, strict=True)
+        if distance <= near.distance.min() + MARGIN or graph.usable_lanes[k] == best
+    }
+    past = {k for k in found if found[k][1] >= graph.length[k] - 1e-6}
+    gone = {k for k in past if any(s in found for s in graph.successors[k])}
+    gone |= {
+        s for k in found.keys() - past for s in graph.successors[k] if s in found and found[s][1] <= 1e-6
+    }
+    kept = sorted(found.keys() - gone, key=lambda k: (k != best, round(found[k][0], 3), k))
+    return [(k, found[k][1]) for k in kept]
+
+
+def _nearest(graph: LaneGraph, near: Near, turn: NDArray[np.float64], count: int) -> Indices:
+    """[count] lane of each point, see :func:`lane_of`, from lanes near to them and the angles to these."""
+    result = np.full(count, -1, dtype=np.int64)
+    smallest = np.full(count, np.inf)
+    np.minimum.at(smallest, near.point, near.distance)
+    close = near.distance <= smallest[near.point] + _TIE
+    order = np.lexsort((near.line, np.round(turn / _TURN_TIE), ~close, near.point))
+    point, first = np.unique(near.point[order], return_index=True)
+    result[point] = graph.usable_lanes[near.line[order][first]]
+    return result
+
+
+def _compatible(
+    graph: LaneGraph, position: NDArray[Any], heading: NDArray[Any], tolerance: float
+) -> tuple[Near, NDArray[np.float64]]:
+    near = graph.index.near(position, tolerance)
+    turn = turn_between(near.heading, np.asarray(heading, dtype=np.float64)[near.point])
+    keep = turn <= LANE_TURN
+    return near.only(keep), turn[keep]
+
+
+REACH = 2.0  # metres from a region's centre line, or from its entry point, within which a trajectory is on it
+APART = 0.5  # metres by which every alternative must be farther away before a region counts as chosen
+TURN = math.pi / 4  # largest angle between a vehicle on a region and the region
 
 
 def visited_regions(
@@ -31,17 +113,8 @@ def visited_regions(
     region if it lies within 2 m of the centre line with a compatible heading, and clearly so if every alternative
     is at least half a metre farther away. So of the alternatives of one choice each pass takes at most one.
 
-    Args:
-        graph: the lane graph.
-        position: [..., T, 2] metres.
-        heading: [..., T] radians.
-        valid: [..., T].
-
-    Returns:
-        [..., R], in the order of ``graph.regions``.
-
-    Raises:
-        ValueError: for a valid state that is not finite.
+    Takes positions [..., T, 2] and headings [..., T]; gives [..., R], in the order of ``graph.regions``. Raises
+    ValueError for a valid state that is not finite.
     """
     lead, steps = valid.shape[:-1], valid.shape[-1]
     count = math.prod(lead)
@@ -92,13 +165,8 @@ def _states_on(
 ) -> tuple[Indices, Indices, Indices]:
     """States clearly on a region, ascending, those regions, and pairs [K, 2] (choice, first state on it).
 
-    Args:
-        graph: the lane graph.
-        begins: [n] whether a trajectory begins with the state.
-        points: [n, 2] metres.
-        headings: [n] radians.
-        first: [places] a state at each of the distinct places.
-        place: [n] number of the place of each state.
+    Takes whether a trajectory begins with a state [n], its point and heading, a state at each of the distinct places,
+    and the number of the place of each state [n].
     """
     near = graph.region_index.near(points[first], REACH + APART)
     order = np.lexsort((near.line, near.distance, graph.regions.parent[near.line], near.point))
@@ -139,13 +207,8 @@ def _passes(graph: LaneGraph, row: Indices, points: Reals, headings: Reals, plac
 def _repeated(found: Indices, place: Indices, count: int) -> tuple[Indices, Indices]:
     """What was found at distinct places, for all states at them.
 
-    Args:
-        found: [K] numbers of places, ascending.
-        place: [n] of each state.
-        count: places.
-
-    Returns:
-        States, ascending, and the numbers in ``found`` of what was found where they are, ascending for each.
+    Takes numbers of places [K], ascending, that of each state [n] and how many places there are. Gives states,
+    ascending, and the numbers in ``found`` of what was found where they are, ascending for each.
     """
     each = np.bincount(found, minlength=count)
     number, first = each[place], (each.cumsum() - each)[place]

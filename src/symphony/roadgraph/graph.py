@@ -20,21 +20,13 @@ Bools = NDArray[np.bool_]
 
 
 class Near(NamedTuple):
-    """Pairs of a point and a line within reach of it, each [K].
+    """Pairs of a point and a line within reach of it, each [K]."""
 
-    Attributes:
-        point: index of the point.
-        line: index of the line.
-        distance: metres between the two.
-        along: metres from the line's start to its nearest place.
-        heading: direction of the line there, radians.
-    """
-
-    point: Indices
-    line: Indices
-    distance: Reals
-    along: Reals
-    heading: Reals
+    point: Indices  # index of the point
+    line: Indices  # index of the line
+    distance: Reals  # metres between the two
+    along: Reals  # metres from the line's start to its nearest place
+    heading: Reals  # direction of the line there, radians
 
     def only(self, keep: Bools | Indices) -> Near:
         """Some of the pairs."""
@@ -43,11 +35,7 @@ class Near(NamedTuple):
 
 
 class LineIndex:
-    """Spatial index over polylines.
-
-    Args:
-        lines: arrays [P_k, 2] in metres, without repeated points.
-    """
+    """Spatial index over polylines [P_k, 2] in metres, without repeated points."""
 
     def __init__(self, lines: Sequence[Reals]) -> None:
         self.geometry = line_strings(lines)
@@ -98,8 +86,7 @@ def turn_between(a: Reals, b: Reals) -> Reals:
     return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi)
 
 
-BIKE_LANE = 3
-"""The lane type that vehicles keep off (see ``LaneType``)."""
+BIKE_LANE = 3  # the lane type that vehicles keep off (see ``LaneType``)
 
 
 @dataclass(frozen=True)
@@ -108,20 +95,13 @@ class Regions:
 
     Two regions with the same parent are alternatives of one choice. A lane with several branching predecessors
     is a region once for each of them.
-
-    Attributes:
-        lane: [R] the lane that is the region.
-        parent: [R] the lane before it, at whose end the choice is made.
-        curvature: [R] average signed curvature of the lane, 1/m, positive to the left.
-        entry: [R, 2] first point of the lane.
-        entry_heading: [R] direction of the lane there.
     """
 
-    lane: Indices
-    parent: Indices
-    curvature: Reals
-    entry: Reals
-    entry_heading: Reals
+    lane: Indices  # [R] the lane that is the region
+    parent: Indices  # [R] the lane before it, at whose end the choice is made
+    curvature: Reals  # [R] average signed curvature of the lane, 1/m, positive to the left
+    entry: Reals  # [R, 2] first point of the lane
+    entry_heading: Reals  # [R] direction of the lane there
 
     def __len__(self) -> int:
         return len(self.lane)

@@ -14,16 +14,12 @@ from symphony.roadgraph.graph import LaneGraph, Reals, arc_lengths
 
 CHORD = 3.0
 """Metres of a piece of a line that has a direction, and over which a change of direction is measured."""
-GENTLE = 0.09
-"""Radians that a lane turns from one such piece to the next where its radius is 34 m."""
-_STEP = 1.0
-"""Metres between the points of a blend."""
+GENTLE = 0.09  # radians that a lane turns from one such piece to the next where its radius is 34 m
+_STEP = 1.0  # metres between the points of a blend
 _SMOOTH = 1.5
 """Metres to either side over which the direction of a line is taken when something is moved beside it."""
-_CLOSE = 1e-6
-"""Metres between points that are one."""
-_JOINED = 0.02
-"""Metres between two lanes that meet."""
+_CLOSE = 1e-6  # metres between points that are one
+_JOINED = 0.02  # metres between two lanes that meet
 _JOIN = 6.0
 """Metres along for a metre to the side, where a lane does not begin exactly where the one before it ends."""
 
@@ -35,13 +31,8 @@ def blend(line: Reals, point: Reals, length: float) -> Reals:
     0 to 1 over the length: it begins and ends in the direction of the line. Beyond that it is the line itself. Where
     the point is before the beginning of the line, the line is taken to come straight from there.
 
-    Args:
-        line: the line to get to, with P >= 2 points that differ from their neighbours.
-        point: [2] where the way begins.
-        length: metres along the line until the way is on it; less, where the line ends before.
-
-    Returns:
-        [Q, 2] the way, of which the first point is ``point``; the point alone, if the line ends behind it.
+    Neighbouring points of the line differ. The length is metres along it until the way is on it, or less, where it
+    ends before. The first point [Q, 2] of the way is ``point``; the point alone, if the line ends behind it.
     """
     begin, _ = beside(line, point)
     if begin < 0.0:

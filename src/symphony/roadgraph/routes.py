@@ -26,46 +26,32 @@ from symphony.roadgraph.paths import (
     sharpest,
 )
 
-HORIZON = 240.0
-"""Metres ahead up to which routes take every branch: 10 s at 20 m/s and a margin."""
-LIMIT = 200
-"""Most routes a vehicle gets."""
-MAX_LANES = 500
-"""Most lanes of a route."""
+HORIZON = 240.0  # metres ahead up to which routes take every branch: 10 s at 20 m/s and a margin
+LIMIT = 200  # most routes a vehicle gets
+MAX_LANES = 500  # most lanes of a route
 
 CHANGE_METRES, CHANGE_SECONDS = 20.0, 3.0
 """A change of lanes takes so many metres, or so many seconds at the vehicle's speed, whichever is longer."""
 CHANGE_TURN = np.radians(25.0)
 """Largest angle between two lanes where one changes, and what a change may turn more within 3 m than the lanes do."""
-CHANGE_WIDTH = 7.0
-"""Metres between the centre lines of two lanes beside each other, at most."""
-SAME = 1.0
-"""Metres within which two routes are one."""
+CHANGE_WIDTH = 7.0  # metres between the centre lines of two lanes beside each other, at most
+SAME = 1.0  # metres within which two routes are one
 _TIE = 1e-3
-_SLACK = 30.0
-"""Metres of a route beyond 1.5 times the way driven that are compared with it."""
+_SLACK = 30.0  # metres of a route beyond 1.5 times the way driven that are compared with it
 _RETURN_METRES, _RETURN_WIDTH = 25.0, 6.0
 """A line comes by a place twice where, so many metres farther along, it is within so many metres of it."""
 
 
 class Route(NamedTuple):
-    """Lanes in driving order, with at most one change of lanes.
+    """Lanes in driving order, with at most one change of lanes."""
 
-    Attributes:
-        lanes: each a successor of the one before, but for the one that the change leads to.
-        change: place in ``lanes`` of the lane that the change leads to; 0 for none.
-        begins: metres along the lane before that one at which the change begins.
-        beside: metres along the lane it leads to of the place beside that.
-    """
-
-    lanes: tuple[int, ...]
-    change: int = 0
-    begins: float = 0.0
-    beside: float = 0.0
+    lanes: tuple[int, ...]  # each a successor of the one before, but for the one that the change leads to
+    change: int = 0  # place in ``lanes`` of the lane that the change leads to; 0 for none
+    begins: float = 0.0  # metres along the lane before that one at which the change begins
+    beside: float = 0.0  # metres along the lane it leads to of the place beside that
 
 
-Path = tuple[float, Route]
-"""How far a route reaches ahead of the vehicle, in metres, and the route."""
+Path = tuple[float, Route]  # how far a route reaches ahead of the vehicle, in metres, and the route
 
 
 def routes(
@@ -83,15 +69,8 @@ def routes(
     neighbour begins beside the route (a turn pocket). If there are more routes than the limit, the nearest branches
     are all kept, and beyond them routes go on along the straightest lane.
 
-    Args:
-        graph: the lane graph.
-        starts: pairs (lane, metres from the lane's start at which the vehicle is).
-        horizon: metres ahead of the vehicle within which every branch is followed.
-        onward: metres past the horizon for which routes go on along the straightest lane.
-        limit: most routes to return.
-
-    Raises:
-        ValueError: the limit is not positive.
+    Starts are pairs (lane, metres from its start at which the vehicle is). Every branch is followed within the
+    horizon, metres ahead of the vehicle; ``onward`` metres past it routes go on along the straightest lane.
     """
     if limit < 1:
         raise ValueError(f"limit must be at least 1, is {limit}")
@@ -213,12 +192,9 @@ def route_line(
     :func:`~symphony.roadgraph.paths.blend` from the lane it leaves to the one beside it, :func:`change_length` long,
     or half of that where it is too sharp. Where that is too sharp as well, nobody can drive the route.
 
-    Args:
-        graph: the lane graph.
-        route: one with a change begins on the lane that is left.
-        start: metres along the first lane at which the line begins.
-        speed: m/s of the vehicle where it begins.
-        changes: lines up to where changes are over, kept for other routes that have the same.
+    The line begins ``start`` metres along the first lane, where the vehicle has a speed in m/s; a route with a change
+    begins on the lane that is left. ``changes`` keeps lines up to where changes are over for routes that have the
+    same.
     """
     if not route.change:
         return centre_line(graph, route.lanes, start)
@@ -270,13 +246,8 @@ def route_lines(
 ) -> tuple[list[Route], list[Reals]]:
     """Routes that can be driven, without those that are the same within :data:`SAME`, and their lines.
 
-    Args:
-        graph: the lane graph.
-        found: routes, of which the first of several that are the same is kept.
-        along: metres along the first lanes of routes at which lines begin.
-        spacing: metres between the points of a line; the last piece may be shorter.
-        length: metres after which lines end.
-        speed: m/s of the vehicle.
+    Of several that are the same the first is kept. Lines begin so many metres ``along`` the first lanes, end after a
+    length in metres, and have points that are ``spacing`` metres apart; the last piece may be shorter.
     """
     kept: list[Route] = []
     lines: list[Reals] = []
@@ -332,9 +303,7 @@ def route_errors(
     Only the part of a line that can have been reached counts. Of a line that comes by a place twice only the pass
     counts that the path is on: else one that goes around the block first would be as right as the direct one.
 
-    Args:
-        lines: of the routes, with the same number of metres between all points but the last two.
-        path: T >= 1 places in the order of time.
+    Lines have the same number of metres between all points but the last two; the path has one place or more.
     """
     path = np.asarray(path, np.float64)
     driven = np.hypot(*np.diff(path, axis=0).T).sum()
@@ -383,13 +352,7 @@ def ground_truth_routes(
     that part beyond the trajectory's end, and all of them where no step is valid. To take one of them by its place
     would bias what is learned of choices.
 
-    Args:
-        lines: of the routes, see :func:`route_lines`.
-        trajectory: of the vehicle.
-        valid: which of its states exist.
-
-    Raises:
-        ValueError: there are no routes.
+    Takes the lines of routes (:func:`route_lines`) and a trajectory. Raises ValueError where there are no routes.
     """
     if not lines:
         raise ValueError("no routes to choose from")

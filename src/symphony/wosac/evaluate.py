@@ -1,4 +1,4 @@
-"""The WOSAC score of an agent on any run segments, beside log playback and constant velocity."""
+"""The WOSAC score of an agent on any run segments, who goes first there, and the scores of baselines beside it."""
 
 from __future__ import annotations
 
@@ -11,18 +11,23 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
 
 from symphony.agents import Agent, load_agent
 from symphony.config import WosacSettings
 from symphony.data.report import Skip
-from symphony.data.segment import RunSegment
+from symphony.data.resample import resample
+from symphony.data.segment import AgentType, RunSegment, SignalState
+from symphony.data.selection import relations
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.evaluator import BASELINES
-from symphony.metrics import OrderStatistics
+from symphony.metrics import OrderStatistics, order_statistics, passing_gap
 from symphony.metrics.intervals import clustered_mean
 from symphony.rollouts.workers import shared
-from symphony.wosac.passing import PassingGaps, order_of, passing_gaps, passing_pairs
 from symphony.wosac.scorer import (
     CHALLENGES,
     SimulatedRollouts,
@@ -31,9 +36,139 @@ from symphony.wosac.scorer import (
     check_scored,
     score,
 )
-from symphony.wosac.scorer.config import FUTURE, ROLLOUTS
-from symphony.wosac.segments import log_playback, wosac_scenario, wosac_window
+from symphony.wosac.scorer.config import CURRENT, DT, FUTURE, ROLLOUTS
 from symphony.wosac.simulate import constant_velocity, wosac_rollouts
+
+_AWAY, _APART = 1e5, 1e3  # metres from the origin, and from one another, at which agents do not meet anyone
+_FAR = 1e5
+"""Metres from the world's origin beyond which float32, in which all is scored, has steps of a centimetre and more."""
+_TIMED = ("position", "heading", "velocity", "valid", "signal_state")
+
+
+def wosac_window(segment: RunSegment, future: int = FUTURE) -> RunSegment:
+    """The first 9 s of a segment as the challenge has them: 91 steps of 0.1 s, of which step 10 is the current one.
+
+    Other time steps are brought to 0.1 s by :func:`symphony.data.resample.resample`. Of a segment between 8 and 9 s
+    the future is kept whole and the history is shorter: its first steps are valid for nobody, and go back from the
+    first logged one at its velocity, so that there is no jump in speed. Where the world's origin is more than 100 km
+    away, as in maps with UTM coordinates, that of the segment takes its place.
+
+    With fewer steps of the future than 80 all of the above is so much shorter. Raises a :class:`DataError` for less
+    than 8 s.
+    """
+    tenth = segment if abs(segment.dt - DT) < 1e-6 else resample(segment, DT)
+    steps = min(tenth.num_steps, CURRENT + 1 + future)
+    if steps <= future:
+        message = f"has {(tenth.num_steps - 1) * DT:g} s, the score needs {future * DT:g}"
+        raise DataError(message, file=segment.file or None, segment=segment.segment_id, field="valid")
+    missing = CURRENT + 1 + future - steps
+
+    def taken(values: Any) -> Any:
+        return np.pad(values[:, :steps], [(0, 0), (missing, 0), *[(0, 0)] * (values.ndim - 2)])
+
+    found = {name: taken(getattr(tenth, name)) for name in _TIMED}
+    back = np.arange(-missing, 0)[:, None] * DT
+    found["position"][:, :missing] = tenth.position[:, :1]
+    found["position"][:, :missing, :2] += tenth.velocity[:, :1] * back
+    found["heading"][:, :missing] = tenth.heading[:, :1]
+    origin = np.where(np.abs(tenth.origin).max() > _FAR, 0.0, tenth.origin)
+    return tenth.replace(dt=DT, current_step=CURRENT, origin=origin, **found)
+
+
+def wosac_scenario(window: RunSegment) -> WosacScenario:
+    """What is scored of a :func:`wosac_window`.
+
+    Scored are the ego and the agents the source marks for prediction, as far as they are valid at step 10; where it
+    marks none, all agents that are. The road's boundary stands for road edges; lanes and lights are the segment's.
+    Raises a :class:`DataError` where it can't be scored; names the segment.
+    """
+    present = window.valid[:, CURRENT]
+    chosen = np.zeros(len(present), bool)
+    chosen[[window.ego, *window.predict.tolist()]] = True
+    scored = present & (chosen | (len(window.predict) == 0))
+    road, origin = window.road, window.origin
+    light, step = (window.signal_state != SignalState.UNKNOWN).nonzero()
+    return WosacScenario(
+        window.segment_id,
+        future=window.num_steps - CURRENT - 1,
+        object_id=window.agent_id.astype(np.int64),
+        object_type=window.agent_type.astype(np.int64),
+        position=window.position + origin,
+        heading=window.heading,
+        size=window.size,
+        valid=window.valid,
+        evaluated=np.sort(window.agent_id[scored]).astype(np.int64),
+        road_edges=[road.boundary[k] + origin for k in range(len(road.boundary))],
+        lanes=[road.lanes[k] + origin for k in range(len(road.lanes))],
+        lane_id=road.lane_id.astype(np.int64),
+        lane_type=road.lane_type.astype(np.int64),
+        signal_step=step,
+        signal_lane=road.lane_id[window.signal_lane[light]].astype(np.int64),
+        signal_state=window.signal_state[light, step].astype(np.int64),
+        signal_point=window.signal_point[light, :2] + origin[:2],
+    )
+
+
+def log_playback(window: RunSegment) -> SimulatedRollouts:
+    """32 times the log of a :func:`wosac_window`; agents that it does not see are far away from everyone."""
+    rows, later = np.flatnonzero(window.valid[:, CURRENT]), slice(CURRENT + 1, None)
+    place = (window.position[rows, later] + window.origin).astype(np.float64)
+    away = np.zeros((len(rows), 1, 3))
+    away[:, 0, 0] = _AWAY + _APART * np.arange(len(rows))
+    place = np.where(window.valid[rows, later, None], place, away + window.origin)
+    states = np.concatenate([place, window.heading[rows, later, None].astype(np.float64)], -1)
+    return SimulatedRollouts(window.agent_id[rows], *np.moveaxis(np.repeat(states[None], ROLLOUTS, 0), -1, 0))
+
+
+EVERY = 2  # steps of 0.1 s between those at which paths are looked at
+
+
+class PassingGaps(NamedTuple):
+    """Seconds by which the first of each of K pairs is ahead of the second, NaN where their paths don't meet."""
+
+    simulated: Float[Tensor, "R K"]
+    log: Float[Tensor, " K"]
+
+
+def passing_pairs(window: RunSegment) -> NDArray[np.int64]:
+    """[K, 2] rows of the vehicles that merge or cross in the log after the current step, both valid at it."""
+    now = window.current_step
+    timed = ("position", "heading", "velocity", "valid", "signal_state")
+    future = window.replace(
+        dt=window.dt * EVERY, current_step=0, **{name: getattr(window, name)[:, now::EVERY] for name in timed}
+    )
+    rows = np.flatnonzero(window.valid[:, now] & (window.agent_type == AgentType.VEHICLE))
+    pairs = []
+    for k, row in enumerate(rows[:-1]):
+        others = rows[k + 1 :]
+        found = relations(future.replace(ego=int(row)), others)
+        pairs += [(row, other) for other in others[np.minimum(found.merge, found.crossing) < np.inf]]
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+def passing_gaps(window: RunSegment, pairs: NDArray[np.int64], rollouts: SimulatedRollouts) -> PassingGaps:
+    """Gaps of K pairs of rows [K, 2] (see :func:`passing_pairs`) in rollouts of everyone and in the log."""
+    column = {int(name): k for k, name in enumerate(rollouts.object_id)}
+    simulated, log = [torch.zeros(len(rollouts.x), 0)], [torch.zeros(0)]
+    for pair in pairs:
+        # Steps 12, 14, …: of rollouts, which begin with step 11, every other one.
+        columns = [column[int(window.agent_id[row])] for row in pair]
+        states = np.stack([rollouts.x, rollouts.y], -1)[:, columns, EVERY - 1 :: EVERY] - window.origin[:2]
+        first, second = torch.from_numpy(states).unbind(1)
+        always = torch.ones(first.shape[:-1], dtype=torch.bool)
+        dt = window.dt * EVERY
+        simulated.append(passing_gap(first, second, always, always, dt)[:, None])
+        future = slice(window.current_step + EVERY, None, EVERY)
+        place = torch.from_numpy(window.position[pair][:, future, :2].astype(np.float64))
+        valid = torch.from_numpy(window.valid[pair][:, future])
+        log.append(passing_gap(place[0], place[1], valid[0], valid[1], dt)[None])
+    return PassingGaps(torch.cat(simulated, -1), torch.cat(log))
+
+
+def order_of(found: Sequence[PassingGaps]) -> OrderStatistics:
+    """All pairs of all run segments together."""
+    return order_statistics(torch.cat([one[0] for one in found], -1), torch.cat([one[1] for one in found]))
+
 
 WOSAC_BASELINES = (*BASELINES, "idm", "random")
 """Scored beside every agent: log playback, constant velocity, the intelligent driver model along the lanes, and
@@ -52,31 +187,18 @@ class SegmentResult(NamedTuple):
 
 @dataclass(frozen=True)
 class WosacEvaluation:
-    """Scores of an agent and of the baselines.
+    """Scores of an agent and of the baselines."""
 
-    Attributes:
-        config: year of the challenge.
-        agent: its name.
-        how: what decides the rollouts, see :func:`simulated_how`.
-        data: name and checksum of the store.
-        segments: [K] ids of the run segments that were scored.
-        groups: [K] the recording of each.
-        objects: [K] how many of its objects are scored.
-        rates: [K] steps per second of its log in the store; the score brings all to 10.
-        results: [K] by agent.
-        left_out: run segments that can't be scored, and why.
-    """
-
-    config: str
-    agent: str
-    how: dict[str, Any]
-    data: dict[str, str]
-    segments: list[str]
-    groups: list[str]
-    objects: list[int]
-    rates: list[float]
-    results: dict[str, list[SegmentResult]]
-    left_out: list[Skip]
+    config: str  # year of the challenge
+    agent: str  # its name
+    how: dict[str, Any]  # what decides the rollouts, see :func:`simulated_how`
+    data: dict[str, str]  # name and checksum of the store
+    segments: list[str]  # [K] ids of the run segments that were scored
+    groups: list[str]  # [K] the recording of each
+    objects: list[int]  # [K] how many of its objects are scored
+    rates: list[float]  # [K] steps per second of its log in the store; the score brings all to 10
+    results: dict[str, list[SegmentResult]]  # [K] by agent
+    left_out: list[Skip]  # run segments that can't be scored, and why
 
     def numbers(self, agent: str) -> dict[str, tuple[float, float]]:
         """Mean of every number over run segments, and its standard error over recordings (NaN for a single one)."""
@@ -166,16 +288,9 @@ def evaluate_wosac(
 ) -> WosacEvaluation:
     """Score an agent on run segments of a store, and beside it :data:`WOSAC_BASELINES`.
 
-    Args:
-        agent: drives the vehicles.
-        store: of segments with any time step.
-        items: numbers of the run segments.
-        settings: how the agent is simulated.
-        config: year of the challenge.
-        progress: called with the segments done and their total.
-        baselines: with them.
-        strict: a run segment that can't be scored (too short, without road edges, vehicles or a future) is an error
-            instead of being left out.
+    Takes the numbers of the run segments, which may have any time step, and the year of the challenge. Where
+    ``strict`` a run segment that can't be scored (too short, without road edges, vehicles or a future) is an error
+    instead of being left out. ``progress`` is called with the segments done and their total.
 
     Raises:
         ConfigError: no such year, or the agent can't be simulated so.
@@ -217,11 +332,7 @@ def evaluate_wosac(
 
 
 def scorable(store: SegmentStore, items: Sequence[int], future: int = FUTURE) -> None:
-    """See that some run segment can be scored.
-
-    Raises:
-        DataError: none can; names the first.
-    """
+    """See that some run segment can be scored. Raises a :class:`DataError` where none can; names the first."""
     first: DataError | None = None
     for item in items:
         try:

@@ -102,22 +102,14 @@ def score_files(
     One scenario is in memory at a time, a few for each worker. Scenarios that can't be scored, such as one without
     road edges, vehicles or a future, are left out.
 
-    Args:
-        scenarios: WOMD scenario file, folder of them, or pattern.
-        rollouts: ``.npz`` of the only scenario's rollouts, or a folder with ``SCENARIO_ID.npz`` for each.
-        partial: leave out scenarios without rollouts, instead of an error.
-        config: year of the challenge.
-        workers: processes.
-        per_object: with the scores of each object.
-        strict: a scenario that can't be scored is an error.
-        progress: called with the scenarios done and, where known, all there are.
+    Scenarios are a WOMD scenario file, a folder of them, or a pattern; rollouts the ``.npz`` of the only scenario, or
+    a folder with ``SCENARIO_ID.npz`` for each, of which with ``partial`` some may be missing. ``config`` is the year
+    of the challenge. With ``per_object`` there are the scores of each object, too; where ``strict``, a scenario that
+    can't be scored is an error. ``progress`` is called with the scenarios done and, where known, all there are.
 
-    Returns:
-        The mean over scenarios, every scenario's own scores and what was left out, as JSON can hold it; and what was
-        left out.
-
-    Raises:
-        DataError: rollouts don't fit, or no scenario can be scored; names file, scenario, agent and field.
+    Gives the mean over scenarios, every scenario's own scores and what was left out, as JSON can hold it; and what
+    was left out. Raises a :class:`DataError` where rollouts don't fit, or no scenario can be scored, that names file,
+    scenario, agent and field.
     """
     total = len(list(rollouts.glob("*.npz"))) if rollouts.is_dir() else 1
     results: list[dict[str, Any]] = []

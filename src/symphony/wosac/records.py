@@ -16,14 +16,12 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from symphony.data.sources import womd_pb2 as pb
-from symphony.data.sources.tfrecord import read_records
-from symphony.data.sources.womd import WomdReader
+from symphony.data.sources.womd import WomdReader, read_records
 from symphony.errors import DataError
 from symphony.wosac.scorer import WosacScenario
 from symphony.wosac.scorer.config import CURRENT, DT, FUTURE
 
-STEPS = CURRENT + 1 + FUTURE
-"""Steps of a scenario."""
+STEPS = CURRENT + 1 + FUTURE  # steps of a scenario
 
 _STATE = attrgetter("center_x", "center_y", "center_z", "heading", "valid")
 _POINT = attrgetter("x", "y", "z")
@@ -31,10 +29,8 @@ _POINT = attrgetter("x", "y", "z")
 
 def read_scenarios(path: Path) -> Iterator[tuple[Path, int, bytes]]:
     """Yield (file, number of the record in it, payload) of every record of the scenario files meant by a file, a
-    folder (searched) or a pattern with ``*``.
-
-    Raises:
-        DataError: there are none, or a file or record is damaged; names it.
+    folder (searched) or a pattern with ``*``. Raises a :class:`DataError` where there are none, or a file or record
+    is damaged; names it.
     """
     if path.is_dir():
         files = sorted({file for pattern in WomdReader.patterns for file in path.rglob(pattern)})
@@ -50,11 +46,7 @@ def read_scenarios(path: Path) -> Iterator[tuple[Path, int, bytes]]:
 
 
 def parse_scenario(payload: bytes, file: Path, record: int) -> pb.Scenario:
-    """Decode a record.
-
-    Raises:
-        DataError: it is no scenario; names file and record.
-    """
+    """Decode a record. Raises a :class:`DataError` where it is no scenario; names file and record."""
     try:
         scenario = pb.Scenario.FromString(payload)
         name: str | bytes = scenario.scenario_id
@@ -69,8 +61,7 @@ def parse_scenario(payload: bytes, file: Path, record: int) -> pb.Scenario:
 def simulated_ids(scenario: pb.Scenario) -> list[int]:
     """Ids of the objects that rollouts must hold: all that are valid at step 10, in the record's order.
 
-    Raises:
-        DataError: naming scenario and field.
+    Raises a :class:`DataError` that names scenario and field.
     """
     _check_steps(scenario, CURRENT + 1)
     return [track.id for track in scenario.tracks if track.states[CURRENT].valid]
@@ -79,8 +70,7 @@ def simulated_ids(scenario: pb.Scenario) -> list[int]:
 def logged_scenario(scenario: pb.Scenario) -> WosacScenario:
     """A record as it is scored; positions float64, world frame.
 
-    Raises:
-        DataError: it can't be scored; names scenario and field.
+    Raises a :class:`DataError` where it can't be scored; names scenario and field.
     """
     _check_times(scenario)
     _check_steps(scenario, STEPS)

@@ -2,11 +2,10 @@
 
 Nothing of the log after the current step is used: only agents that are valid then take part, and lights keep the
 latest state seen up to then. The learned agent drives all vehicles, however few it was trained to drive. Those that
-stand stay, and people walk on; whoever drives sees the latter at constant velocity. See
-:mod:`symphony.wosac.bystanders`.
+stand stay, and people walk on; whoever drives sees the latter at constant velocity.
 
-Legend: n agents valid at the current step, N vehicles among them, R rollouts, F future steps (80), U decisions and
-the first state.
+Legend: A agents, n of them valid at the current step, N vehicles among these, R rollouts, F future steps (80), U
+decisions and the first state.
 """
 
 from __future__ import annotations
@@ -35,17 +34,76 @@ from symphony.roadgraph import LaneGraph
 from symphony.rollouts.driving import simulation
 from symphony.rollouts.unroll import NotFiniteError
 from symphony.rollouts.workers import shared
-from symphony.wosac.bystanders import standing, walks
+from symphony.streams import Stream, fold_in, stream_of, uniform
 from symphony.wosac.records import parse_scenario, read_scenarios
 from symphony.wosac.scorer import SimulatedRollouts
 from symphony.wosac.scorer.config import CURRENT, DT, FUTURE, ROLLOUTS
 from symphony.wosac.scorer.scenario import STATES
 
+STILL = 0.2
+"""Metres that a vehicle that stands has moved in the last second, at most; at speeds up to twice that a second."""
+AHEAD, ASIDE = 60.0, 3.0  # metres ahead and to a side within which a light is a vehicle's own
+PACE, COURSE = 0.4, 0.17
+"""How much people's speeds (a share) and courses (radians, 10 degrees) differ between rollouts, either way."""
+_GO = (SignalState.ARROW_GO, SignalState.GO)
+_STOP = (SignalState.ARROW_STOP, SignalState.STOP)
+
+
+def standing(segment: RunSegment) -> NDArray[np.bool_]:
+    """[A] vehicles that have stood for the last second and have no reason to go: no green light ahead of them.
+
+    In logs, those under a green light go within 8 s, of the others one in eight or fewer.
+    """
+    now = segment.current_step
+    past = slice(max(now - round(1 / segment.dt), 0), now + 1)
+    away = np.linalg.norm(segment.position[:, past, :2] - segment.position[:, now, None, :2], axis=-1)
+    still = np.where(segment.valid[:, past], away, 0.0).max(1) <= STILL
+    still &= np.linalg.norm(segment.velocity[:, now], axis=-1) <= 2 * STILL
+    still &= segment.valid[:, now] & (segment.agent_type == AgentType.VEHICLE)
+    # The latest state seen of each light, and where it is in the frame of each vehicle.
+    seen = segment.signal_state[:, now::-1]
+    shown = seen[np.arange(len(seen)), (seen != SignalState.UNKNOWN).argmax(1)]
+    delta = segment.signal_point[None, :, :2] - segment.position[:, now, None, :2]
+    cos, sin = np.cos(segment.heading[:, now, None]), np.sin(segment.heading[:, now, None])
+    along, aside = cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]
+    own = (along > 0) & (along < AHEAD) & (np.abs(aside) < ASIDE)
+    green, red = ((own & np.isin(shown, states)).any(1) for states in (_GO, _STOP))
+    return np.asarray(still & ~(green & ~red))
+
+
+def walks(
+    segment: RunSegment, rows: NDArray[np.int64], rollouts: int, steps: int, seed: int
+) -> NDArray[np.float64]:
+    """[R, n, F, 3] x, y, heading of pedestrians and whoever else is driven by nobody.
+
+    They keep their velocity, each rollout with a pace and a course of its own, and their headings change as they did
+    at some step of the last second, drawn anew for each step.
+    """
+    now = segment.current_step
+    stream = fold_in(torch.tensor(stream_of(segment.segment_id)), Stream.WALKS)
+    agents = torch.from_numpy(segment.agent_id[rows].astype(np.int64))
+    line = fold_in(fold_in(stream, torch.arange(rollouts)[:, None]), agents)[..., None]
+    drawn = uniform(seed, line, torch.arange(steps + 2)).double().numpy()
+    pace, course = 1 + PACE * (2 * drawn[..., 0] - 1), COURSE * (2 * drawn[..., 1] - 1)
+    velocity = segment.velocity[rows, now].astype(np.float64)
+    cos, sin = pace * np.cos(course), pace * np.sin(course)
+    x, y = cos * velocity[:, 0] - sin * velocity[:, 1], sin * velocity[:, 0] + cos * velocity[:, 1]
+    time = np.arange(1, steps + 1) * segment.dt
+    path = segment.position[rows, now, None, :2] + np.stack([x, y], -1)[:, :, None] * time[:, None]
+    past = slice(max(now - round(1 / segment.dt), 0), now + 1)
+    heading, valid = segment.heading[rows, past].astype(np.float64), segment.valid[rows, past]
+    turns = np.where(valid[:, 1:] & valid[:, :-1], wrap(np.diff(heading)), 0.0)
+    turns -= turns.mean(1, keepdims=True)
+    which = (drawn[..., 2:] * turns.shape[1]).astype(np.int64)
+    turned = np.take_along_axis(np.broadcast_to(turns, (rollouts, *turns.shape)), which, -1).cumsum(-1)
+    found = wrap(heading[:, -1, None] + course[..., None] + turned)
+    return np.concatenate([path, found[..., None]], -1)
+
+
 Doubles = NDArray[np.float64]
 _TIMED = ("position", "heading", "velocity", "valid")
 
-AT_ONCE = 1600
-"""Observations made at a time in a search, 0.1 MB each."""
+AT_ONCE = 1600  # observations made at a time in a search, 0.1 MB each
 
 
 def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings) -> SimulatedRollouts:
@@ -56,10 +114,9 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings) -
     They are in the world frame of the log, headings in [-π, π). Of the segment, with steps of 0.1 s, what lies behind
     its current step, 10, is not looked at, but for the routes where they are the log's.
 
-    Raises:
-        ConfigError: the agent is log playback, or can't search as asked for.
-        DataError: other steps, or nobody is valid at the current one.
-        NotFiniteError: a network of the agent puts out a number that is not finite; names the segment.
+    Raises a :class:`ConfigError` where the agent is log playback, or can't search as asked for, a :class:`DataError`
+    for other steps, or where nobody is valid at the current one, and a :class:`NotFiniteError` that names the segment
+    where a network of the agent puts out a number that is not finite.
     """
     if agent.policy is None:
         raise ConfigError("log playback knows the future and can't be simulated")
@@ -84,8 +141,7 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings) -
 def constant_velocity(segment: RunSegment, future: int = FUTURE) -> SimulatedRollouts:
     """32 equal rollouts of everyone at the velocity and heading of the current step.
 
-    Raises:
-        DataError: as :func:`wosac_rollouts`.
+    Raises a :class:`DataError` as :func:`wosac_rollouts` does.
     """
     rows = _present(segment)
     return _rollouts(segment, rows, _extrapolated(segment, rows, future))
@@ -96,8 +152,7 @@ def simulated_scenarios(
 ) -> Iterator[tuple[str, SimulatedRollouts]]:
     """Yield id and rollouts of every WOMD scenario of a file, folder or pattern; everyone's, odd ones included.
 
-    Raises:
-        DataError: a record can't be used; names file, scenario and field.
+    Raises a :class:`DataError` where a record can't be used; names file, scenario and field.
     """
     work = partial(_simulated, agent, settings)
     with closing(shared(work, read_scenarios(data), settings.config(1, 0))) as results:
@@ -122,10 +177,7 @@ def _simulated(
 
 def with_the_rest(found: SimulatedRollouts, segment: RunSegment) -> SimulatedRollouts:
     """Rollouts of everyone in a segment, as a submission must hold them: agents that were left out as odd go on at
-    their velocity.
-
-    Raises:
-        DataError: a state of theirs at the current step is not finite.
+    their velocity. Raises a :class:`DataError` where a state of theirs at the current step is not finite.
     """
     now = segment.current_step
     rest = np.asarray(segment.valid[:, now] & ~np.isin(segment.agent_id, found.object_id))

@@ -96,18 +96,9 @@ def write_submission(
 ) -> int:
     """Write an archive; one scenario at a time is in memory, and ``out`` appears once all are written.
 
-    Args:
-        rollouts: scenario ids and their rollouts.
-        meta: what the submission says about itself.
-        out: file to write, ``.tar.gz``.
-        shards: files in the archive; scenarios are dealt out to them in turn.
-
-    Returns:
-        How many scenarios were written.
-
-    Raises:
-        ConfigError: ``meta``, ``out`` or ``shards`` can't be used.
-        DataError: rollouts that the server would refuse; names scenario, field and agent.
+    Scenarios are dealt out to so many ``shards``, files in the archive, in turn. Gives how many were written. Raises
+    a :class:`ConfigError` where ``meta``, ``out`` (a ``.tar.gz``) or ``shards`` can't be used, and a
+    :class:`DataError` that names scenario, field and agent for rollouts that the server would refuse.
     """
     if shards < 1:
         raise ConfigError(f"shards must be at least 1, is {shards}")
@@ -156,9 +147,8 @@ def _pack(files: list[Path], out: Path) -> None:
 def scenario_message(scenario_id: str, rollouts: SimulatedRollouts) -> pb.ScenarioRollouts:
     """The message of a scenario's rollouts.
 
-    Raises:
-        DataError: not 32 rollouts of 80 steps of finite numbers, an agent twice, or an id that the format has no room
-            for; names scenario, field and agent.
+    Raises a :class:`DataError` for other than 32 rollouts of 80 steps of finite numbers, an agent twice, or an id
+    that the format has no room for; names scenario, field and agent.
     """
     ids = rollouts.object_id
     try:
@@ -191,10 +181,8 @@ class Report:
 
 def required_agents(path: Path) -> dict[str, list[int]]:
     """The agents that each scenario's rollouts must hold, by scenario id, from WOMD scenario files (see
-    :func:`symphony.wosac.records.read_scenarios`); those of the test set will do.
-
-    Raises:
-        DataError: a file or record can't be used; names it.
+    :func:`symphony.wosac.records.read_scenarios`); those of the test set will do. Raises a :class:`DataError` where a
+    file or record can't be used; names it.
     """
     found: dict[str, list[int]] = {}
     for file, record, payload in read_scenarios(path):
@@ -211,13 +199,8 @@ def required_agents(path: Path) -> dict[str, list[int]]:
 def check_submission(path: Path, required: Mapping[str, list[int]] | None = None) -> Report:
     """Read a submission from end to end, one scenario at a time.
 
-    Args:
-        path: the ``.tar.gz``.
-        required: agents by scenario (see :func:`required_agents`). Without it, that scenarios and agents are the
-            right ones is not checked; only that all rollouts of a scenario have the same agents.
-
-    Raises:
-        OSError: the file can't be opened.
+    Without the ``required`` agents by scenario (see :func:`required_agents`), that scenarios and agents are the right
+    ones is not checked; only that all rollouts of a scenario have the same agents.
     """
     report, metas = Report(), set[bytes]()
     try:

@@ -28,8 +28,7 @@ COLUMNS = (
     Column("simulated_offroad_rate", "off-road %", 1, 100.0),
     Column("min_ade", "minADE m", 2),
 )
-HORIZON = 8.0
-"""Seconds that the challenge has simulated; a record with others says so."""
+HORIZON = 8.0  # seconds that the challenge has simulated; a record with others says so
 _WORDS = {
     "playback": "log playback",
     "constant_velocity": "constant velocity",
@@ -39,11 +38,7 @@ _WORDS = {
 
 
 def read_wosac(file: Path) -> dict[str, Any]:
-    """A record of `symphony wosac evaluate`.
-
-    Raises:
-        DataError: it is none; names the file.
-    """
+    """A record of `symphony wosac evaluate`. Raises a :class:`DataError` where it is none; names the file."""
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
         record["agents"][record["agent"]]["segments"], record["how"], record["data"]["checksum"]
@@ -55,10 +50,8 @@ def read_wosac(file: Path) -> dict[str, Any]:
 
 def wosac_table(records: Sequence[dict[str, Any]], names: Sequence[str] = ()) -> str:
     """A table in Markdown: the baselines of the first record that has them, a line for the agent of each record, by
-    its name or what the record calls it and how it was simulated, and what the table is of.
-
-    Raises:
-        ConfigError: of different run segments, years or horizons, or not a name for each.
+    its name or what the record calls it and how it was simulated, and what the table is of. Raises a
+    :class:`ConfigError` for different run segments, years or horizons, or too few names.
     """
     if names and len(names) != len(records):
         raise ConfigError(f"{len(names)} names for {len(records)} records")

@@ -78,8 +78,7 @@ Columns = dict[str, NDArray[Any]]
 class Argoverse2Reader(Reader):
     """Reads Argoverse 2 motion-forecasting scenarios.
 
-    Raises:
-        ConfigError: pyarrow is not installed.
+    Raises a :class:`ConfigError` where pyarrow is not installed.
     """
 
     name = "argoverse2"

@@ -74,8 +74,7 @@ class CommonRoadReader(Reader):
             yields a segment for each of those vehicles, in order of id, with ``_ego<ID>`` added to its name; all
             in one frame, on one map.
 
-    Raises:
-        ConfigError: ``egos`` is neither.
+    Raises a :class:`ConfigError` where ``egos`` is neither.
     """
 
     name = "commonroad"

@@ -42,10 +42,8 @@ from symphony.data.sources.base import Doubles, Item, Reader, check_choice, loca
 from symphony.data.sources.interaction_tracks import NOMINAL, Rows
 from symphony.errors import ConfigError, DataError
 
-FAR = 200.0
-"""Metres between a recording and the box around its map beyond which the two don't belong together."""
-HISTORY = 9
-"""The last step of a case's first second."""
+FAR = 200.0  # metres between a recording and the box around its map beyond which they don't belong together
+HISTORY = 9  # the last step of a case's first second
 MAX_STEPS = 360_000  # steps of a recording, which is cut into windows: ten hours at 10 Hz
 START, END = 3.0, 8.0  # metres by which a lane's start and end may miss those of a connection
 LATE = 5000  # milliseconds by which the phases may end before the tracks (in the one real recording: 1200)
@@ -85,8 +83,7 @@ class InteractionReader(Reader):
             its positions; ``"positions"`` computes velocities, replaces headings that are far off the motion, and
             takes the mean of states logged twice.
 
-    Raises:
-        ConfigError: a value out of range.
+    Raises a :class:`ConfigError` for a value out of range.
     """
 
     name = "interaction"

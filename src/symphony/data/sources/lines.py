@@ -23,10 +23,8 @@ MAX_EDGES, MAX_NEAR, MAX_CROSSINGS, MAX_KNOTS = 500_000, 2_000_000, 50_000, 500
 """Edges of outlines, pairs of them whose boxes overlap, pairs that cross, and pairs of one outline that do: the time
 and memory of a union grow with them, with the last by a power. Maps of 7 000 edges had 1 500 crossings."""
 PROBES = 200
-MAX_BOUND, SPACING = 10_000.0, 2.0
-"""Metres of a lane's bound, at most, and between the points of a centre line."""
-CUT = 0.3
-"""Metres by which a ring may miss the cut it was closed along."""
+MAX_BOUND, SPACING = 10_000.0, 2.0  # metres of a lane's bound, at most; between points of a centre line
+CUT = 0.3  # metres by which a ring may miss the cut it was closed along
 SLIT = 0.1  # metres by which neighbouring areas may miss each other on either side and still bound no slit
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from symphony.render.viewer.pack import Event, Replay, packed
-from symphony.render.viewer.page import view_page
+from symphony.render.viewer.pack import Event, Replay, packed, view_page
 
 __all__ = ["Event", "Replay", "packed", "view_page"]

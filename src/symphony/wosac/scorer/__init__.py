@@ -11,16 +11,6 @@ from symphony.wosac.scorer.scenario import SimulatedRollouts, WosacScenario
 from symphony.wosac.scorer.scoring import check_scored, mean_scores, object_scores, score, score_features
 
 __all__ = [
-    "CHALLENGES",
-    "Component",
-    "SimulatedRollouts",
-    "WosacConfig",
-    "WosacFeatures",
-    "WosacScenario",
-    "check_scored",
-    "compute_features",
-    "mean_scores",
-    "object_scores",
-    "score",
-    "score_features",
-]
+    "CHALLENGES", "Component", "SimulatedRollouts", "WosacConfig", "WosacFeatures", "WosacScenario",
+    "check_scored", "compute_features", "mean_scores", "object_scores", "score", "score_features",
+]  # fmt: skip

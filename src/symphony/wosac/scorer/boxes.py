@@ -10,39 +10,26 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-NONE = 1e10
-"""Distance, in metres, where there is no other valid object."""
-ROUNDING = 0.7
-"""Share of half the shorter side by which the corners of a box are rounded."""
-FAR_AHEAD = 5.0
-"""Greatest time to collision, seconds."""
+NONE = 1e10  # distance, in metres, where there is no other valid object
+ROUNDING = 0.7  # share of half the shorter side by which the corners of a box are rounded
+FAR_AHEAD = 5.0  # greatest time to collision, seconds
 SAME_WAY, NEARLY_SAME_WAY = math.radians(75.0), math.radians(10.0)
 """Heading differences up to which an object ahead is followed, and one that overlaps little sideways."""
-LITTLE_OVERLAP = 0.5
-"""Metres of sideways overlap that are little."""
-_PAIRS = 1 << 20
-"""Pairs of an object and another one, per step, looked at together."""
+LITTLE_OVERLAP = 0.5  # metres of sideways overlap that are little
+_PAIRS = 1 << 20  # pairs of an object and another one, per step, looked at together
 _SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 _BY_TURNS = ([0, 1, 1, 2, 2, 3, 3, 0], [0, 0, 1, 1, 2, 2, 3, 3])
 """Corners of either rectangle that each corner of the octagon of :func:`rectangle_gap` is made of."""
 
 
 class Boxes(NamedTuple):
-    """Boxes of n objects over T steps in R rollouts.
+    """Boxes of n objects over T steps in R rollouts."""
 
-    Attributes:
-        position: [R, n, T, 2] centres, metres.
-        heading: [R, n, T] radians.
-        size: [R, n, T, 2] length and width, metres.
-        valid: [R, n, T].
-        speed: [R, n, T] m/s in the plane, NaN where unknown.
-    """
-
-    position: Float[Tensor, "R n T 2"]
-    heading: Float[Tensor, "R n T"]
-    size: Float[Tensor, "R n T 2"]
+    position: Float[Tensor, "R n T 2"]  # centres, metres
+    heading: Float[Tensor, "R n T"]  # radians
+    size: Float[Tensor, "R n T 2"]  # length and width, metres
     valid: Bool[Tensor, "R n T"]
-    speed: Float[Tensor, "R n T"]
+    speed: Float[Tensor, "R n T"]  # m/s in the plane, NaN where unknown
 
     def blocks(self, evaluated: int) -> Iterator[Boxes]:
         """A few rollouts at a time, as many as memory is meant for."""

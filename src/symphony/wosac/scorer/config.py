@@ -7,28 +7,21 @@ from dataclasses import dataclass
 
 CURRENT, FUTURE = 10, 80
 """Index of the last step that is known to the simulator, number of steps that are simulated."""
-DT = 0.1
-"""Seconds per step."""
-ROLLOUTS = 32
-"""Rollouts of a scenario that the challenge asks for."""
+DT = 0.1  # seconds per step
+ROLLOUTS = 32  # rollouts of a scenario that the challenge asks for
 
 
 @dataclass(frozen=True)
 class Component:
-    """A component of the score.
+    """A component of the score."""
 
-    Attributes:
-        weight: its weight in the metametric.
-        bins: (low, high, number of bins) of the histogram of a number, in m, s and rad; what lies outside counts as
-            low or high. None for a yes or no, such as whether an object ever collides.
-    """
-
-    weight: float
+    weight: float  # its weight in the metametric
+    # (low, high, number of bins) of the histogram of a number, in m, s and rad; what lies outside counts as
+    # low or high. None for a yes or no, such as whether an object ever collides.
     bins: tuple[float, float, int] | None = None
 
 
-WosacConfig = Mapping[str, Component]
-"""The components of a challenge by their names."""
+WosacConfig = Mapping[str, Component]  # the components of a challenge by their names
 
 BUCKETS: Mapping[str, tuple[str, ...]] = {
     "kinematic": ("linear_speed", "linear_acceleration", "angular_speed", "angular_acceleration"),

@@ -29,27 +29,19 @@ class WosacFeatures:
     (rad/s), ``angular_acceleration`` (rad/s²), ``distance_to_nearest_object`` (m, below 0 is ``collision_per_step``),
     ``time_to_collision`` (s, at most 5), ``distance_to_road_edge`` (m, above 0 is ``offroad_per_step``),
     ``traffic_light_violation_per_step``, ``average_displacement_error`` ([..., E], m from the log, with the history).
-
-    Attributes:
-        object_id: [E] ascending.
-        object_type: [E].
-        log_valid: [E, 80] where the log is valid.
-        log: [E, 80] by name.
-        simulated: [R, E, 80] by name.
     """
 
-    object_id: Int[Tensor, " E"]
+    object_id: Int[Tensor, " E"]  # ascending
     object_type: Int[Tensor, " E"]
-    log_valid: Bool[Tensor, "E 80"]
-    log: dict[str, Tensor]
-    simulated: dict[str, Tensor]
+    log_valid: Bool[Tensor, "E 80"]  # where the log is valid
+    log: dict[str, Tensor]  # [E, 80] by name
+    simulated: dict[str, Tensor]  # [R, E, 80] by name
 
 
 def compute_features(scenario: WosacScenario, rollouts: SimulatedRollouts) -> WosacFeatures:
     """Features of log and rollouts.
 
-    Raises:
-        DataError: the two don't fit together; names scenario, field and agent.
+    Raises a :class:`DataError` where the two don't fit together; names scenario, field and agent.
     """
     try:
         rollouts.check(scenario.sim_agents, scenario.future)
@@ -84,22 +76,17 @@ class _Tracks(NamedTuple):
 
     Row 0 of R is the log itself, with the log's own validity. The others are rollouts: history as logged, valid where
     it was, and a future that is valid throughout. Boxes have the size of step 10 throughout.
-
-    Attributes:
-        rows: [n] of the scenario's objects: the E evaluated ones first, by ascending id, then the others.
-        evaluated: E.
-        x, y, z, heading, valid: [R, n, 91].
-        size: [n, 3].
     """
 
+    # [n] of the scenario's objects: the E evaluated ones first, by ascending id, then the others
     rows: np.ndarray
-    evaluated: int
-    x: Tensor
-    y: Tensor
-    z: Tensor
-    heading: Tensor
-    valid: Tensor
-    size: Tensor
+    evaluated: int  # E
+    x: Tensor  # [R, n, 91]
+    y: Tensor  # [R, n, 91]
+    z: Tensor  # [R, n, 91]
+    heading: Tensor  # [R, n, 91]
+    valid: Tensor  # [R, n, 91]
+    size: Tensor  # [n, 3]
 
 
 def _tracks(scenario: WosacScenario, rollouts: SimulatedRollouts) -> _Tracks:

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from symphony.wosac.scorer.road import first_of_least
 
-RED = (1, 4)
-"""States of a red signal: arrow stop and stop; flashing ones are none."""
+RED = (1, 4)  # states of a red signal: arrow stop and stop; flashing ones are none
 
 
 @dataclass(frozen=True)
@@ -25,18 +24,12 @@ class Lanes:
 
     On every lane with fewer points than the longest one, one more segment leads from the last point to the world's
     origin: the official scorer takes the first of the padding for one.
-
-    Attributes:
-        start: [S, 2] first point, metres.
-        along: [S, 2] from the first point to the last.
-        squared: [S] squared length.
-        lane: [S] id of the lane.
     """
 
-    start: Float[Tensor, "S 2"]
-    along: Float[Tensor, "S 2"]
-    squared: Float[Tensor, " S"]
-    lane: Int[Tensor, " S"]
+    start: Float[Tensor, "S 2"]  # first point, metres
+    along: Float[Tensor, "S 2"]  # from the first point to the last
+    squared: Float[Tensor, " S"]  # squared length
+    lane: Int[Tensor, " S"]  # id of the lane
 
     @classmethod
     def of(cls, lines: Sequence[Any], lane_id: Any) -> Lanes:
@@ -88,16 +81,11 @@ class Lanes:
 
 @dataclass(frozen=True)
 class Signals:
-    """Q signals over T steps.
+    """Q signals over T steps."""
 
-    Attributes:
-        lane: [Q] id of the lane.
-        red: [Q, T].
-        point: [Q, T, 2] where to stop, the world's origin at steps without an observation.
-    """
-
-    lane: Int[Tensor, " Q"]
+    lane: Int[Tensor, " Q"]  # id of the lane
     red: Bool[Tensor, "Q T"]
+    # [Q, T, 2] where to stop, the world's origin at steps without an observation
     point: Float[Tensor, "Q T 2"]
 
     @classmethod

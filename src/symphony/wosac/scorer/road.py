@@ -14,37 +14,23 @@ from torch import Tensor
 
 from symphony.wosac.scorer.boxes import corners
 
-NOWHERE = -1e10
-"""Distance, in metres, of an object that is not valid."""
-STRETCH = 3.0
-"""Weight of height in choosing the nearest edge, so that one on another level is not taken."""
-CLOSED = 1.0
-"""Square metres between the ends of a line below which it is closed."""
-_CELL = 1.0
-"""Metres. A choice of speed, as is the next one: results don't depend on them."""
-_TOGETHER = 1 << 16
-"""Points looked at together."""
+NOWHERE = -1e10  # distance, in metres, of an object that is not valid
+STRETCH = 3.0  # weight of height in choosing the nearest edge, so that one on another level is not taken
+CLOSED = 1.0  # square metres between the ends of a line below which it is closed
+_CELL = 1.0  # metres. A choice of speed, as is the next one: results don't depend on them.
+_TOGETHER = 1 << 16  # points looked at together
 
 
 @dataclass(frozen=True)
 class Edges:
-    """S segments of oriented polylines.
+    """S segments of oriented polylines."""
 
-    Attributes:
-        start: [S, 3] first point, metres.
-        along: [S, 3] from the first point to the last.
-        squared: [S] squared length in the plane.
-        previous: [S] the segment before on the same line, -1 for none.
-        following: [S] the one after.
-        tree: of the segments in the plane.
-    """
-
-    start: Float[Tensor, "S 3"]
-    along: Float[Tensor, "S 3"]
-    squared: Float[Tensor, " S"]
-    previous: Int[Tensor, " S"]
-    following: Int[Tensor, " S"]
-    tree: shapely.STRtree
+    start: Float[Tensor, "S 3"]  # first point, metres
+    along: Float[Tensor, "S 3"]  # from the first point to the last
+    squared: Float[Tensor, " S"]  # squared length in the plane
+    previous: Int[Tensor, " S"]  # the segment before on the same line, -1 for none
+    following: Int[Tensor, " S"]  # the one after
+    tree: shapely.STRtree  # of the segments in the plane
 
     @classmethod
     def of(cls, lines: Sequence[Any]) -> Edges:

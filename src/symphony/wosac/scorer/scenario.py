@@ -12,13 +12,10 @@ from numpy.typing import NDArray
 from symphony.errors import DataError
 from symphony.wosac.scorer.config import CURRENT, FUTURE
 
-VEHICLE = 1
-"""Object type of vehicles."""
-SURFACE_STREET = 2
-"""Type of the lanes that count for traffic lights."""
+VEHICLE = 1  # object type of vehicles
+SURFACE_STREET = 2  # type of the lanes that count for traffic lights
 STATES = ("x", "y", "z", "heading")
-_NAMED = 10
-"""Agents named in an error."""
+_NAMED = 10  # agents named in an error
 
 Ints = NDArray[np.integer[Any]]
 Reals = NDArray[np.floating[Any]]
@@ -51,8 +48,7 @@ class WosacScenario:
         future: steps after step 10, all of which are simulated and scored; the challenge's 80, or fewer for logs that
             are shorter. "91" above and in what is made of a scenario is 11 more than this.
 
-    Raises:
-        DataError: it can't be scored; names scenario, field and agent.
+    Raises a :class:`DataError` where it can't be scored; names scenario, field and agent.
     """
 
     scenario_id: str
@@ -119,15 +115,9 @@ class SimulatedRollouts:
     heading: Reals
 
     def check(self, agents: Ints | None = None, future: int = FUTURE, count: int | None = None) -> None:
-        """See that all is there and finite.
+        """See that all is there and finite, and as many agents, steps and rollouts as there must be.
 
-        Args:
-            agents: ids of the agents that there must be, where that is known.
-            future: steps there must be.
-            count: rollouts there must be, where that is prescribed.
-
-        Raises:
-            DataError: naming field and agent.
+        Raises a :class:`DataError` that names field and agent.
         """
         if self.object_id.ndim != 1:
             raise DataError(f"has shape {self.object_id.shape}, expected (agents,)", field="object_id")
@@ -150,8 +140,7 @@ class SimulatedRollouts:
 def check_agents(found: Ints, wanted: Ints) -> None:
     """See that rollouts hold just the wanted agents.
 
-    Raises:
-        DataError: an agent is missing, there more than once, or not one of those to simulate.
+    Raises a :class:`DataError` where an agent is missing, there more than once, or not one of those to simulate.
     """
     ids, counts = np.unique(found, return_counts=True)
     for who, problem in (

@@ -36,17 +36,15 @@ def score(
 ) -> dict[str, float]:
     """Score the rollouts of a scenario.
 
-    Returns:
-        ``metametric``, the score of the challenge: the weighted sum of the likelihoods; each component's likelihood
-        (``NAME_likelihood``, 0 to 1); the weighted means of the groups of components (``kinematic_metrics``,
-        ``interactive_metrics``, ``map_based_metrics``); metres from the log with the history, as the mean over
-        rollouts and objects (``average_displacement_error``) and of the best rollout (``min_ade``); shares of
-        rollouts and objects that collide, leave the road or run a red light at a step at which the log is valid
-        (``simulated_collision_rate`` and so on).
+    Gives ``metametric``, the score of the challenge: the weighted sum of the likelihoods; each component's likelihood
+    (``NAME_likelihood``, 0 to 1); the weighted means of the groups of components (``kinematic_metrics``,
+    ``interactive_metrics``, ``map_based_metrics``); metres from the log with the history, as the mean over rollouts
+    and objects (``average_displacement_error``) and of the best rollout (``min_ade``); shares of rollouts and objects
+    that collide, leave the road or run a red light at a step at which the log is valid (``simulated_collision_rate``
+    and so on).
 
-    Raises:
-        DataError: the two don't fit together, or there is nothing to score a component with; names scenario, field
-            and agent.
+    Raises a :class:`DataError` where the two don't fit together, or there is nothing to score a component with; names
+    scenario, field and agent.
     """
     try:
         return score_features(compute_features(scenario, rollouts), config)
@@ -57,8 +55,7 @@ def score(
 def score_features(features: WosacFeatures, config: WosacConfig = CHALLENGES["2025"]) -> dict[str, float]:
     """What :func:`score` returns, from features that were computed before.
 
-    Raises:
-        DataError: at no step the log says anything about a component; names it.
+    Raises a :class:`DataError` where at no step the log says anything about a component; names it.
     """
     found = {}
     for name, values in log_likelihoods(features, config).items():
