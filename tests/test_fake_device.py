@@ -92,6 +92,14 @@ def test_steps_of_open_traffic_stay_on_the_device():
         assert_there(env.step(act(env, env.start(number, number)))["next"])
 
 
+def test_forgotten_goals_are_looked_for_once():
+    env = DrivingEnv(ROADS, observation=EVERYTHING)
+    with pretend() as device:
+        start = on(device, env).start(*[torch.arange(2, device=device.device)] * 2)
+        with pytest.raises(DataDependentOutputException):
+            env.step(act(env, start))
+
+
 def test_the_pretended_device_notices():
     with pretend() as device:
         there = torch.zeros(3, device=device.device)

@@ -21,7 +21,7 @@ from symphony.envs.routes import route_choices
 from symphony.envs.scene import SceneBatch, SceneSource, Tables, leaving
 from symphony.errors import ConfigError
 from symphony.geometry.frames import with_speed
-from symphony.geometry.nearest import on_host
+from symphony.geometry.nearest import has_values, on_host
 from symphony.streams import fold_in
 
 Event = Literal["collision", "offroad"]
@@ -292,8 +292,10 @@ class DrivingEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         now = self._read(tensordict)
-        if self.observation.route and not self._followed and on_host(now.goal) and bool((now.goal < 0).all()):
-            raise ConfigError(NO_GOALS)
+        if self.observation.route and not self._followed and has_values():
+            if bool((now.goal < 0).all()):
+                raise ConfigError(NO_GOALS)
+            self._followed = now.goal.device.type != "cpu"  # where looking waits, once is enough
         index = _of(self.scenes.interactive, now.scene)
         size = self.scenes.box_size[now.scene[..., None], index]
         after = self._moved(tensordict, now.state, size)

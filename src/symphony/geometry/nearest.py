@@ -12,15 +12,17 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 
+def has_values() -> bool:
+    """Whether values may be looked at: outside of ``torch.compile`` and of transforms of ``torch.func``."""
+    return not torch.compiler.is_compiling() and torch._C._functorch.peek_interpreter_stack() is None
+
+
 def on_host(tensor: Tensor) -> bool:
-    """Whether values may steer the computation: on the CPU, outside of ``torch.compile`` and ``torch.func``.
+    """Whether values may steer the computation: on the CPU, where there are any.
 
     There a step may look at a few numbers to leave out work; elsewhere that would wait for the device.
     """
-    if tensor.device.type != "cpu" or torch.compiler.is_compiling():
-        return False
-    # Under a transform of torch.func, such as vmap, there are no values to look at.
-    return torch._C._functorch.peek_interpreter_stack() is None
+    return tensor.device.type == "cpu" and has_values()
 
 
 def places(flags: Bool[Tensor, "M N"]) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
