@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import torch
 
+from helpers_pool import Counted, die_at_three, environment, fail_at_three, slow_square
 from helpers_processes import forget, output_of
 from helpers_runs import tiny
 from helpers_segments import crossing, straight_road
@@ -25,8 +26,9 @@ from symphony.cli import main
 from symphony.config import METHODS, EvaluateConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
-from symphony.errors import DataWarning
+from symphony.errors import DataError, DataWarning, SymphonyError
 from symphony.learning.demonstrations import SceneDataset
+from symphony.parallel import ordered_map
 from symphony.recipes import train
 from symphony.saved.saving import save_simulation
 
@@ -108,8 +110,8 @@ def test_several_processes(example: Any) -> None:
 
 
 @pytest.mark.slow
-def test_many_machines(example: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two workers; Ray gives them the folders where modules are."""
+def test_ray(example: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two workers of one cluster are as those of one machine, and collect; they get the folders where modules are."""
     ray = pytest.importorskip("ray")
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("RAY_worker_niceness", "0")  # 15 by default: on a busy machine they would hardly run
@@ -117,6 +119,16 @@ def test_many_machines(example: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     path = {"env_vars": {"PYTHONPATH": os.pathsep.join(sys.path)}}
     ray.init(num_cpus=2, include_dashboard=False, runtime_env=path)
     try:
+        tasks = Counted(20)
+        results = ordered_map(slow_square, tasks, workers=2, engine="ray")
+        assert next(results) == 0
+        assert tasks.taken == 4
+        assert list(results) == [k * k for k in range(1, 20)]
+        assert list(ordered_map(environment, ["OMP_NUM_THREADS"], engine="ray")) == ["1"]
+        with pytest.raises(DataError, match="file log, segment s, field agents: three"):
+            list(ordered_map(fail_at_three, range(10), workers=2, engine="ray"))
+        with pytest.raises(SymphonyError, match="a Ray worker failed"):
+            list(ordered_map(die_at_three, range(10), workers=2, engine="ray"))
         first, second = machines.collected(2, batches=2, rows=3, branches=2, steps=4)
     finally:
         ray.shutdown()

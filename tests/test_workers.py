@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers_agents import make_agent
+from helpers_pool import Counted, die_at_three, environment, fail_at_three, slow_square
 from helpers_processes import apart, share_the_server
 from helpers_segments import crossing, straight_road
 from symphony import keys
@@ -192,27 +192,6 @@ def test_workers_end_with_the_command(store: SegmentStore, tmp_path: Path, how: 
     assert said == f"symphony: error: {'interrupted' if how == signal.SIGINT else 'terminated'}"
 
 
-def slow_square(number: int) -> int:
-    time.sleep(0.05 if number % 3 == 0 else 0.0)
-    return number * number
-
-
-def environment(name: str) -> str:
-    return os.environ.get(name, "")
-
-
-def fail_at_three(number: int) -> int:
-    if number == 3:
-        raise DataError("three", file="log", segment="s", field="agents")
-    return number
-
-
-def die_at_three(number: int) -> int:
-    if number == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number
-
-
 def alive(pid: int) -> bool:
     try:
         return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
@@ -226,18 +205,6 @@ def gone(pids: list[int]) -> bool:
     while any(map(alive, pids)) and time.monotonic() < until:
         time.sleep(0.02)
     return not any(map(alive, pids))
-
-
-class Counted:
-    """An iterator that knows how much of it was taken."""
-
-    def __init__(self, total: int) -> None:
-        self.taken, self.total = 0, total
-
-    def __iter__(self) -> Iterator[int]:
-        for k in range(self.total):
-            self.taken += 1
-            yield k
 
 
 @pytest.mark.parametrize("workers", [1, 3])
@@ -353,24 +320,3 @@ def test_bad_arguments_are_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> N
     for options, message in [*bad, ({"engine": "ray"}, r"pip install 'symphony-traffic\[ray\]'")]:
         with pytest.raises(ConfigError, match=message):
             ordered_map(slow_square, [1], **options)
-
-
-@pytest.mark.slow
-def test_ray_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    ray = pytest.importorskip("ray")
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # for its workers
-    monkeypatch.setenv("RAY_worker_niceness", "0")  # 15 by default: on a busy machine they would hardly run
-    try:
-        tasks = Counted(20)
-        results = ordered_map(slow_square, tasks, workers=2, engine="ray")
-        assert next(results) == 0
-        assert tasks.taken == 4
-        assert list(results) == [k * k for k in range(1, 20)]
-        assert list(ordered_map(environment, ["OMP_NUM_THREADS"], engine="ray")) == ["1"]
-        with pytest.raises(DataError, match="file log, segment s, field agents: three"):
-            list(ordered_map(fail_at_three, range(10), workers=2, engine="ray"))
-        with pytest.raises(SymphonyError, match="a Ray worker failed"):
-            list(ordered_map(die_at_three, range(10), workers=2, engine="ray"))
-    finally:
-        ray.shutdown()
