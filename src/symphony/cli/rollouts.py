@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import nullcontext
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -35,6 +36,9 @@ class Simulate(shared.Simulation):
     #: for one that comes past a point (metres, in the frame of the segment); all others as the agent draws them.
     goal: Annotated[tuple[str, ...], arg(metavar="ID=PLACE ...")] = ()
     tree: bool = True  # Leave out the branches that a search pruned.
+    config: Annotated[evaluation.SimulateConfig, arg(name="")] = field(
+        default_factory=evaluation.SimulateConfig
+    )
 
     def __post_init__(self) -> None:
         evaluation.check_planner_seconds(self.planner_seconds)
@@ -155,6 +159,8 @@ class Report(shared.Command):
             count = totals.get(f"{name}_segments", segments)
             rows.append([name, cell, "" if count == segments else f"{count} of {segments} segments"])
         shared.print_table(rows, f"{found.agent}: {runs} runs, {failed} failed")
+        if "parts" in plain:
+            shared.print_facts(plain["parts"], "the log, which ends before the runs do, and what is past it")
         shared.say(f"written: {out / 'report.html'}")
         if runs and runs == failed:
             raise errors.AllFailedError(f"all {runs} runs failed; report.json says why each did")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
 from symphony.config.agent import SearchConfig
-from symphony.config.checks import Count, Names, Natural, NotNegative, Positive, Settings
+from symphony.config.checks import Bounds, Count, Names, Natural, NotNegative, Positive, Settings
 from symphony.errors import ConfigError
 
 Search = Literal["agent", "none", "tree", "backtrack", "best"]
@@ -15,6 +15,9 @@ ScoreName = Literal["agent", "discriminator", "flags", "rule"]
 Goals = Literal["agent", "tree", "branch"]
 Others = Literal["log", "constant_velocity", "idm", "learned"]
 Engine = Literal["local", "ray"]
+AfterCollision = Literal["go-on", "stop", "remove", "respawn"]
+MOST_INFLOW = 1.0
+"""Vehicles per second that want to enter on a lane, at most: twice what one can carry."""
 Setting = Literal["main", "long", "many"]
 """Tables of the paper: 10 s with 2 interactive agents, 20 s with 2, 10 s with 8."""
 PaperData = Literal["proprietary", "womd"]
@@ -124,6 +127,26 @@ class EvaluateConfig(SimulationConfig):
         for path in self.metric:
             if ":" not in path:
                 raise ConfigError(f"metric is an import path such as my.metrics:jerk, not '{path}'")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulateConfig(EvaluateConfig):
+    """How agents are simulated where nothing is compared with the log, so that open traffic can go on past it."""
+
+    #: Vehicles per second that want to enter on each lane that begins at the edge of the map, past the end of a log
+    #: that is shorter than `duration`; by default as many as came in the log.
+    inflow: Annotated[float | None, Bounds(0.0, MOST_INFLOW)] = None
+    #: Seconds of green, amber and all red of each phase of the traffic lights past the end of the log; by default
+    #: they keep the cycle that the log shows, or take 25, 3 and 2.
+    lights: tuple[float, ...] = ()
+    #: What becomes of agents whose boxes overlap: they `go-on`, `stop` for as long as they overlap, or are not there
+    #: from the next step on (`remove`), or until there is room where they came from (`respawn`).
+    after_collision: AfterCollision = "go-on"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.lights and not (len(self.lights) == 3 and self.lights[0] > 0 and min(self.lights) >= 0):
+            raise ConfigError(f"lights are three lengths in seconds, green above 0: not {self.lights}")
 
 
 WosacScore = Literal["agent", "discriminator", "rule"]

@@ -205,6 +205,8 @@ class RunSegment:
             as a tag. No part of the content hash.
         odd: what is unusual, or was left out (see :mod:`symphony.data.odd`): kind -> example. A store keeps it as a
             tag. No part of the content hash.
+        logged: steps of the log where the segment goes on past it (:mod:`symphony.rollouts.onward`); 0 where all are.
+            No part of the content hash, and never in a store.
     """
 
     segment_id: str
@@ -230,6 +232,7 @@ class RunSegment:
     group: str = field(default="", metadata={"hashed": False})
     joined_gaps: int = field(default=0, metadata={"hashed": False})
     odd: Mapping[str, str] = field(default_factory=dict, metadata={"hashed": False})
+    logged: int = field(default=0, metadata={"hashed": False})
 
     @property
     def num_agents(self) -> int:
@@ -240,6 +243,11 @@ class RunSegment:
     def num_steps(self) -> int:
         """The number of steps, T."""
         return self.position.shape[1]
+
+    @property
+    def log_steps(self) -> int:
+        """The number of logged steps."""
+        return self.logged or self.num_steps
 
     def replace(self, **changes: Any) -> RunSegment:
         """A copy with some fields changed."""
@@ -315,6 +323,7 @@ def _checks(s: RunSegment) -> Iterator[Check]:
     yield from _array("interest", s.interest, (len(s.interest),), np.int32, agents)
     yield from _array("predict", s.predict, (len(s.predict),), np.int32, agents)
     yield from _array("origin", s.origin, (3,), np.float64)
+    yield "logged", 0 <= s.logged <= steps, f"{s.logged} outside the {steps} steps"
     yield "current_step", 0 <= s.current_step < steps, f"{s.current_step} outside the {steps} steps"
     sides = MIN_SIZE, MAX_SIZE
     plausible: tuple[tuple[str, float, float, float, float, str], ...] = (

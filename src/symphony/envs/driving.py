@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -25,6 +25,7 @@ from symphony.geometry.nearest import has_values, on_host
 from symphony.streams import fold_in
 
 Event = Literal["collision", "offroad"]
+AfterCollision = Literal["go-on", "stop", "remove", "respawn"]
 EVENTS = {"collision": keys.COLLISION, "offroad": keys.OFFROAD}  # what can end an episode
 NO_ROUTES = "agents observe or draw routes, but their scenes come without: SceneDataset(..., routes=True)"
 NO_GOALS = "agents observe routes and follow none: TransformedEnv(env, RouteGoals()), or start(..., goal)"
@@ -74,14 +75,18 @@ class DrivingEnv(EnvBase):
         reward: of a step, from the state before it (with its action) and the state after it, ``[*b, N]``; by default
             -1 for an agent that collides or is off the road.
         ends_on: what ends the episode of a scene, for any of its interactive agents.
+        after_collision: what becomes of interactive agents whose boxes overlap another: they ``go-on``, ``stop`` for
+            as long as they overlap, are gone from the next step on (``remove``), or until there is room where they
+            began (``respawn``); the last two in open traffic only.
         seed: of the scenes that :meth:`reset` draws; by default another one in every instance and process.
         generator: draws them instead.
         device: of the scenes from a source; others stay where they are.
 
     ``reset`` starts the scenes named in the ``scene`` entry of its argument, or draws them at random if there is
     none; where only some rows are reset, they start other scenes of those at hand. ``reset(state, set_state=True)``
-    starts from the given simulation state. Raises a :class:`ConfigError` for an unknown name in ``ends_on``, both
-    seed and generator, or routes observed and not there.
+    starts from the given simulation state. Raises a :class:`ConfigError` for an unknown name in ``ends_on`` or
+    ``after_collision``, both seed and generator, routes observed and not there, or agents that leave where traffic
+    is not open.
     """
 
     batch_locked = False
@@ -100,6 +105,7 @@ class DrivingEnv(EnvBase):
         *,
         reward: Callable[[TensorDictBase, TensorDictBase], Tensor] | None = None,
         ends_on: Sequence[Event] = (),
+        after_collision: AfterCollision = "go-on",
         seed: int | None = None,
         generator: torch.Generator | None = None,
         device: torch.device | str = "cpu",
@@ -108,6 +114,11 @@ class DrivingEnv(EnvBase):
         super().__init__(device=device if fixed is None else fixed.log_state.device, batch_size=[])
         if set(ends_on) - EVENTS.keys():
             raise ConfigError(f"ends_on names {', '.join(EVENTS)}, not {', '.join(map(str, ends_on))}")
+        if after_collision not in get_args(AfterCollision):
+            known = ", ".join(get_args(AfterCollision))
+            raise ConfigError(f"after_collision is one of {known}, not {after_collision}")
+        if after_collision in ("remove", "respawn") and not scenes.open_traffic:
+            raise ConfigError(f"after_collision '{after_collision}' needs open traffic")
         if seed is not None and generator is not None:
             raise ConfigError("give a seed or a generator, not both")
         self.source: SceneSource | None = None if isinstance(scenes, SceneBatch) else scenes
@@ -116,7 +127,7 @@ class DrivingEnv(EnvBase):
         if self.observation.route and not getattr(scenes, "routes", True):
             raise ConfigError(NO_ROUTES)
         self.reward = penalty if reward is None else reward
-        self.ends_on = tuple(EVENTS[name] for name in ends_on)
+        self.ends_on, self.after_collision = tuple(EVENTS[name] for name in ends_on), after_collision
         self._rng = torch.Generator() if generator is None else generator
         if generator is None:
             self._set_seed(seed)
@@ -147,7 +158,10 @@ class DrivingEnv(EnvBase):
         self._scenes, before = scenes, (self.open_traffic, self.dt)
         # Read here, once: a step or a search must not wait for the device to tell.
         self.dt = float(scenes.dt[0])  # seconds per step, that of the scenes
-        self.decisions = int(scenes.last_step.max())  # actions until the longest scene's last logged step
+        self.decisions = int(scenes.last_step.max())  # actions until the longest scene's last step
+        self.past_log = bool(
+            (scenes.last_step > scenes.log_end).any()
+        )  # whether some scene goes on past its log
         drawn_open = self.source is not None and self.source.open_traffic
         self.open_traffic = drawn_open or scenes.open_traffic  # whether agents enter and leave
         if (self.open_traffic, self.dt if isinstance(self.dynamics, Displacement) else before[1]) != before:
@@ -223,16 +237,18 @@ class DrivingEnv(EnvBase):
         """
         rollout = torch.as_tensor(rollout, device=scene.device).expand(scene.shape)
         stream = fold_in(self.scenes.stream[scene], rollout)
-        row, index, enter = scene[..., None], self.scenes.interactive[scene], self.scenes.enter[scene]
-        real, early = self.scenes.interactive_valid[scene], enter == 0
-        waiting = real & ~early if self.open_traffic else None
-        # Those that enter later begin where the log has them then.
-        first = with_speed(self.scenes.log_state[row, enter, index])
-        first = torch.cat([first[..., :3], first[..., 3:].clamp_min(0.0)], -1)
+        real, early = self.scenes.interactive_valid[scene], self.scenes.enter[scene] == 0
+        waiting, first = real & ~early if self.open_traffic else None, self._first(scene)
         begin, progress = torch.zeros_like(scene), torch.zeros_like(first[..., 0])
         none = torch.full_like(real, -1, dtype=torch.int64)
         start = State(scene, begin, stream, first, real & early, none, progress, waiting)
         return self._from_state(start if goal is None else self._following(start, goal))
+
+    def _first(self, scene: Int[Tensor, "*b"]) -> Float[Tensor, "*b N 4"]:
+        """The states in which agents begin; those that enter later begin where the log has them then."""
+        row, index, enter = scene[..., None], self.scenes.interactive[scene], self.scenes.enter[scene]
+        first = with_speed(self.scenes.log_state[row, enter, index])
+        return torch.cat([first[..., :3], first[..., 3:].clamp_min(0.0)], -1)
 
     def at(self, state: TensorDictBase) -> TensorDict:
         """Observation and flags of given simulation states (what ``state_spec`` lists), ended ones included."""
@@ -300,10 +316,18 @@ class DrivingEnv(EnvBase):
         size = self.scenes.box_size[now.scene[..., None], index]
         after = self._moved(tensordict, now.state, size)
         after = torch.where(now.valid[..., None], after, now.state)
-        valid, waiting = now.valid, now.waiting
+        valid, waiting, hit = now.valid, now.waiting, None
+        if self.after_collision != "go-on":
+            hit = valid & tensordict.get(keys.COLLISION).squeeze(-1)
+            still = torch.cat([now.state[..., :3], torch.zeros_like(now.state[..., 3:])], -1)
+            after = torch.where(hit[..., None], still, after)
+            valid = valid if self.after_collision == "stop" else valid & ~hit
         if waiting is not None:
             valid, waiting = self._flow(now.scene, now.step + 1, now.state, after, valid, waiting)
         progress = self._progress(now, after)
+        if hit is not None and waiting is not None and self.after_collision == "respawn":
+            waiting, progress = waiting | hit, progress.masked_fill(hit, 0.0)
+            after = torch.where(hit[..., None], self._first(now.scene), after)
         later = now._replace(step=now.step + 1, state=after, valid=valid, progress=progress, waiting=waiting)
         out = self._from_state(later)
         earned = self.reward(tensordict, out)
@@ -335,7 +359,8 @@ class DrivingEnv(EnvBase):
         # Most steps have nobody who could enter; only a device would wait to tell.
         if not on_host(ready) or bool(ready.any()):
             index = self.scenes.interactive[row]
-            enters = entering(self.objects(row, at, new, there | ready), index, ready)
+            late = self.scenes.enter[row] > self.scenes.log_end[row, None] if self.past_log else None
+            enters = entering(self.objects(row, at, new, there | ready), index, ready, late)
             there, waits = there | enters, waits & ~enters
         return there.reshape(valid.shape), waits.reshape(valid.shape)
 

@@ -21,8 +21,10 @@ from symphony.geometry.nearest import nearest, places
 
 OBJECT_FEATURES = 8 + AGENT_FEATURES
 CLEAR = 1.0  # metres that an agent which enters keeps from all others
-FORESEEN = (0.5, 1.0)
-"""Seconds ahead at which its box would meet no other, were everyone to keep speed and course."""
+FORESEEN, LONGER = (0.5, 1.0), (1.5, 2.0)
+"""Seconds ahead at which its box would meet no other, were everyone to keep speed and course; of one that enters past
+the log these, too."""
+HEADWAY = (0.25, 0.5, 0.75, 1.0)  # seconds for which that one could go on if all others stood
 _PLACES = 1 << 22  # positions times logged steps that are looked at together
 
 
@@ -165,8 +167,14 @@ def rollout_heights(
 
 
 @torch.no_grad()
-def entering(objects: Objects, index: Int[Tensor, "M N"], ready: Bool[Tensor, "M N"]) -> Bool[Tensor, "M N"]:
-    """Which agents that are ready can enter, far enough from all others.
+def entering(
+    objects: Objects,
+    index: Int[Tensor, "M N"],
+    ready: Bool[Tensor, "M N"],
+    late: Bool[Tensor, "M N"] | None = None,
+) -> Bool[Tensor, "M N"]:
+    """Which agents that are ready can enter, far enough from all others: farther where they come ``late``, past the
+    log, as nobody knows then that it went well.
 
     Of several that are ready at once the earlier slot goes first: a later one is kept away from where it is, even if
     that one can't enter either. Those that are ready stand among ``objects`` where they enter; ``index`` are the rows
@@ -183,11 +191,14 @@ def entering(objects: Objects, index: Int[Tensor, "M N"], ready: Bool[Tensor, "M
     agent = index[row, slot]
     there = some.others(agent[:, None])[:, 0] & (order[row] < slot[:, None])
     own, own_size = objects.state[row, agent][:, None], objects.size[row, agent][:, None]
-    blocked = torch.zeros_like(there)
-    for seconds, least in ((0.0, CLEAR), *((t, 0.0) for t in FORESEEN)):
-        here, others = (value[..., :2] + seconds * value[..., 3:] for value in (own, some.state))
+    blocked, wary = torch.zeros_like(there), there if late is None else there & late[row, slot][:, None]
+    looks = [(0.0, 0.0, CLEAR, there), *((t, t, 0.0, there) for t in FORESEEN)]
+    if late is not None:
+        looks += [*((t, t, 0.0, wary) for t in LONGER), *((t, 0.0, 0.0, wary) for t in HEADWAY)]
+    for mine, theirs, least, who in looks:
+        here, others = own[..., :2] + mine * own[..., 3:], some.state[..., :2] + theirs * some.state[..., 3:]
         gap = box_gap(here, own[..., 2], own_size, others, some.state[..., 2], some.size)
-        blocked |= there & (gap < least)
+        blocked |= who & (gap < least)
     return ready.index_put((row, slot), ready[row, slot] & ~blocked.any(-1))
 
 

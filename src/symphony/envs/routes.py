@@ -66,18 +66,18 @@ class RouteTable:
 NO_ROUTES = RouteTable(np.zeros((0, 2), np.float32), np.zeros(0, np.int64), np.zeros(0, np.bool_), -1)
 
 
-def drivable(segment: RunSegment) -> float:
-    """Metres that the fastest agent of a segment can drive from its first to its last state, or a little more."""
+def drivable(segment: RunSegment, steps: int) -> float:
+    """Metres that the fastest agent of a segment can drive in so many steps, or a little more."""
     speed = np.linalg.norm(segment.velocity[segment.valid], axis=-1).max(initial=0.0)
-    return min(_FASTER * float(speed), _FASTEST) * (segment.num_steps - 1) * segment.dt
+    return min(_FASTER * float(speed), _FASTEST) * (steps - 1) * segment.dt
 
 
 def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 0) -> RouteTable:
     """Routes that an agent of a segment can take, and which of them it took (paper, section IV-B).
 
     They follow every branch for :data:`symphony.roadgraph.routes.HORIZON` metres, or as far as agents can drive in
-    the segment, and reach :data:`ONWARD` metres beyond what can be driven, unless the map ends. Where they can't be
-    built, a :class:`~symphony.errors.DataWarning` says so, and there are none.
+    the log, and reach :data:`ONWARD` metres beyond what can be driven in the segment, unless the map ends. Where they
+    can't be built, a :class:`~symphony.errors.DataWarning` says so, and there are none.
 
     Routes begin with the agent's first valid state from step ``begin``, at which it comes in, on; of one that comes
     in later with the first on a lane.
@@ -86,8 +86,8 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
     for first in steps.tolist() if begin else steps[:1].tolist():
         if starts := _starts(segment, graph, agent, first):
             break
-    reach, speed = drivable(segment), float(np.linalg.norm(segment.velocity[agent, first]))
-    horizon, length = max(HORIZON, reach), max(HORIZON, reach + ONWARD)
+    reach, speed = drivable(segment, segment.num_steps), float(np.linalg.norm(segment.velocity[agent, first]))
+    horizon, length = max(HORIZON, drivable(segment, segment.log_steps)), max(HORIZON, reach + ONWARD)
     found = routes(graph, starts, horizon=horizon, onward=max(reach + ONWARD - horizon, 0.0))
     try:
         lines = route_lines(graph, found, dict(starts), spacing=SPACING, length=length, speed=speed)[1]

@@ -152,7 +152,8 @@ class SceneBatch(TensorClass):
     background: Tensor  # [N] agents that a rule drives, which nobody evaluates
     exits: Tensor  # [X, 4] where agents leave the map; zeros for padding
     hull: Tensor  # [H, 3] outline of the map
-    last_step: Tensor  # [] int64, the segment's last logged step
+    last_step: Tensor  # [] int64, the segment's last step
+    log_end: Tensor  # [] int64, its last logged step: an earlier one where it goes on past its log
     point: Tensor  # [P, 2]
     point_direction: Tensor  # [P, 2] unit vector along the line, of a light along its lane
     point_type: Tensor  # [P] uint8, PointType
@@ -236,6 +237,7 @@ def scene(
         "exits": np.zeros((0, 4), np.float32) if edge is None else edge.exits,
         "hull": np.zeros((0, 3), np.float32) if edge is None else edge.hull,
         "last_step": segment.num_steps - 1,
+        "log_end": segment.log_steps - 1,
         "light": segment.signal_state.T.astype(np.uint8),
         "agent_height": agent_heights(segment, levels),
         "stream": stream_of(segment.segment_id),

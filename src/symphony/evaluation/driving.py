@@ -171,6 +171,7 @@ def blocking(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Bool
     within = slice(start, start + world.valid.shape[1])
     logged = np.linalg.norm(segment.velocity[evaluated, within].astype(np.float64), axis=-1) <= STANDING
     excused = logged & segment.valid[evaluated, within]
+    excused[:, max(segment.log_steps - start, 0) :] = False
     stands = world.valid[evaluated] & (np.abs(world.speed[evaluated]) <= STANDING) & ~excused
     found, (who, step) = np.zeros(stands.shape, bool), _long(stands, segment.dt).nonzero()
     if not len(who):
@@ -251,7 +252,7 @@ def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> tuple[Re
     there = saved.there[..., evaluated].swapaxes(1, 2)
     path = saved.state[:, :, evaluated, :2].swapaxes(1, 2).astype(np.float64)
     log = saved.segment.position[rows, within, :2].astype(np.float64)
-    seen = saved.segment.valid[rows, within]
+    seen = saved.logged(rows)
     goal = saved.goal[:, evaluated]
     both = there & seen
     driven, compared = _length(path, there), _length(path, both)
@@ -322,6 +323,6 @@ def log_distance(saved: SavedRollouts, evaluated: Indices) -> tuple[Reals, Indic
     """Return the metres from the log, summed over the steps at which there is one, and their number: both [K]."""
     rows, within = saved.agents[evaluated], slice(saved.start + 1, saved.last + 1)
     log = saved.segment.position[rows, within, :2].swapaxes(0, 1)
-    both = saved.counted[:, :, evaluated] & saved.segment.valid[rows, within].T
+    both = saved.counted[:, :, evaluated] & saved.logged(rows)[:, 1:].T
     away = np.linalg.norm(saved.state[:, 1:, evaluated, :2].astype(np.float64) - log, axis=-1)
     return np.where(both, away, 0.0).sum((1, 2)), both.sum((1, 2))

@@ -150,6 +150,8 @@ class _BatchEvaluator:
         """The items, what was found of each agent, and the rollouts of the first where they are asked for."""
         with naming(self.dataset, items):
             scenes = self.dataset.scenes(items).to(torch.device(self.blank[0].config.device))
+            if bool((scenes.last_step > scenes.log_end).any()):
+                raise ConfigError("what is past a log can't be compared with it: simulate and report it")
             log, log_valid = logged(scenes)
             logged_curvature = self._curvatures(items, log, log_valid & ~scenes.background[:, None])
             parts: list[Evaluation] = []

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -66,11 +66,31 @@ class Report:
     collisions: Counter[tuple[str, str, bool, bool]] = field(default_factory=Counter)
     events: dict[str, list[Event]] = field(default_factory=dict)  # of each segment, marked in its replay
     collision_in: dict[str, Array] = field(default_factory=dict)  # of each segment, seconds [K, T, N]
+    # Sums over runs that did not fail, in the log and past its end: seconds of agents, and what happened in them.
+    parts: tuple[dict[str, float], ...] = field(
+        default_factory=lambda: tuple(map(defaultdict, [float, float]))
+    )
 
     def replay(self, saved: SavedRollouts) -> Replay:
         """Return what a viewer shows of a segment; nothing is marked in one that was not evaluated."""
         name = saved.segment.segment_id
         return Replay(saved, self.events.get(name, ()), self.collision_in.get(name))
+
+    def past_log(self) -> Row:
+        """Return what happened past the end of the log beside what did in it (``log``); empty if all is logged."""
+        if not self.parts[1]["seconds"]:
+            return {}
+        found = {}
+        for name, part in zip(("log", "past_log"), self.parts, strict=True):
+            minutes, share = part["seconds"] / 60, _percent(np.array(part["offroad"]), part["seconds"])
+            numbers = {"agent_minutes": minutes, "offroad_time": share}
+            for kind in ("collisions", "red_lights"):
+                numbers |= {
+                    kind: int(part[kind]),
+                    f"{kind}_per_minute": part[kind] / minutes if minutes else None,
+                }
+            found[name] = numbers
+        return found
 
     def worst(self) -> list[Row]:
         """Return the runs, worst first; equal ones in their order."""
@@ -85,7 +105,8 @@ class Report:
         names = ("kind", "other", "at_fault", "with_playback", "collisions")
         kinds = [dict(zip(names, (*key, count), strict=True)) for key, count in self.collisions.most_common()]
         about = {"agent": self.agent, "evaluated": self.evaluated, "units": UNITS} | self.totals()
-        return about | {"collisions": kinds, "per_run": self.worst()}
+        past = {"parts": parts} if (parts := self.past_log()) else {}
+        return about | past | {"collisions": kinds, "per_run": self.worst()}
 
     def csv(self) -> str:
         """Return the runs, worst first; an apostrophe before what looks like a formula, so that none is run."""
@@ -179,6 +200,14 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
             "logged_steps": int(logged[k]),
         }
         found.rows.append(numbers)
+        end = segment.log_steps - 1 - saved.start
+        if k not in saved.failed:
+            for part, within in zip(found.parts, (slice(1, end + 1), slice(end + 1, None)), strict=True):
+                begin, stop, _ = within.indices(world.valid.shape[1])
+                part["seconds"] += segment.dt * int(counted[:, begin - 1 : max(stop - 1, 0)].sum())
+                part["offroad"] += segment.dt * int(off[rows, within].sum())
+                for kind, step in (("collisions", hits.step), ("red_lights", lights.step)):
+                    part[kind] += int(((step >= begin) & (step < stop)).sum())
         found.events[name] += marked
         for hit in (event for event in marked if event.kind == "collision" and k not in saved.failed):
             other = AgentType(segment.agent_type[hit.other]).name.lower()
@@ -206,7 +235,7 @@ def _each(*parts: Array) -> Any:
     return zip(*(part.tolist() for part in parts), strict=True)
 
 
-def _percent(flags: Array, whole: int) -> float | None:
+def _percent(flags: Array, whole: float) -> float | None:
     return 100.0 * float(flags.sum()) / whole if whole else None
 
 

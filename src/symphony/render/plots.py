@@ -333,8 +333,9 @@ def colors_of(segment: RunSegment, agents: Any) -> list[str]:
 
 def describe(segment: RunSegment) -> str:
     """Source, duration, rate and agents of a segment, for a caption."""
-    duration = (segment.num_steps - 1) * segment.dt
+    duration = (segment.log_steps - 1) * segment.dt
     rate, agents = f"{1 / segment.dt:g} Hz", f"{segment.num_agents} agents"
+    rate += " of log" * (segment.logged > 0)
     return f"{segment.source}   ·   {duration:.1f} s at {rate}   ·   {agents}"
 
 

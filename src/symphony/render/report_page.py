@@ -80,8 +80,19 @@ def _head(found: Mapping[str, Any]) -> str:
     return (
         f"<h1>{escape(found['agent'])}</h1><p>{found['runs']} runs of {found['segments']} segments{lost}; "
         f"evaluated: {who}. ± is the standard error over {found['groups']} groups, "
-        "≤ the exact 95 % bound of a zero.</p>"
+        f"≤ the exact 95 % bound of a zero.</p>{_parts(found.get('parts', {}))}"
     )
+
+
+def _parts(parts: Mapping[str, Any]) -> str:
+    if not parts:
+        return ""
+    told = [
+        f"{name}: {part['collisions']:g} collisions, {part['red_lights']:g} red lights "
+        f"in {part['agent_minutes']:.1f} minutes of agents"
+        for name, part in zip(("in the log", "past its end"), parts.values(), strict=True)
+    ]
+    return f"<p>Runs go on past the log; {'; '.join(told)}.</p>"
 
 
 def _tile(found: Mapping[str, Any], name: str, label: str, unit: str) -> str:

@@ -140,7 +140,8 @@ class _Panel:
             axes.plot(*way.T, zorder=5, gid=f"log-{agent}", **line)
         # The blanks are room for the seconds.
         caption = f"{plots.describe(self.segment)}   ·   {clip.words()}"
-        frame(axes, self.view, clip.title or self.segment.segment_id, caption + " " * 12)
+        blanks = " " * (24 if self.segment.logged else 12)
+        frame(axes, self.view, clip.title or self.segment.segment_id, caption + blanks)
         axes.set_anchor("N")
         self.still = set(axes.get_children())
         marks = self._draw_moving(self.steps - 1)
@@ -174,12 +175,13 @@ class _Panel:
             size = np.broadcast_to(segment.size[agent], (len(position), 3))
             draw_boxes(axes, position, heading, size, color, alpha=max(clip.alpha, 0.45), gid=f"box-{agent}")
         # The interactive agents are outlined where they were in the log.
-        seen = clip.agents[segment.valid[clip.agents, step]]
+        seen = clip.agents[segment.valid[clip.agents, step] & (step < segment.log_steps)]
         boxes = place(CORNERS, segment.position[seen, step], segment.heading[seen, step], segment.size[seen])
         style: dict[str, Any] = {"facecolors": "none", "edgecolors": INK, "linewidths": 0.7, "zorder": 11}
         axes.add_collection(PolyCollection(list(boxes), gid="log", **style), autolim=False)
         marks += filter(None, (plots.draw_events(axes, clip, *event, until=at) for event in plots.EVENTS))
-        add_caption(axes, f"{step * segment.dt:.1f} s", right=True)
+        past = ", past the log" * (step >= segment.log_steps)
+        add_caption(axes, f"{step * segment.dt:.1f} s{past}", right=True)
         return marks
 
     def _moving(self) -> list[Artist]:

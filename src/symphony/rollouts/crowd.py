@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from symphony.agents import Agent
 from symphony.config import EvaluateConfig
-from symphony.config.evaluation import MOST, TOGETHER
+from symphony.config.evaluation import MOST, TOGETHER, SimulateConfig
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import MOVING, interactive_choice, named_vehicles, travel
 from symphony.data.store import SegmentStore
@@ -27,6 +27,7 @@ from symphony.errors import DataError, DataWarning
 from symphony.learning.demonstrations import SceneDataset
 from symphony.learning.experts import IN_LANE
 from symphony.roadgraph import LaneGraph, lane_of
+from symphony.rollouts.onward import Onward
 
 Indices = NDArray[np.int64]
 PAIR = 2
@@ -39,7 +40,9 @@ class Crowd:
     stands in a lane. Those beyond :data:`PAIR` must come within a radius of the ego in the log (metres; 0 for no
     limit). In open traffic they enter and leave. Where there is a background, the other vehicles are driven, too, by
     a rule, up to :data:`MOST` with these; along routes, vehicles that are on no lane play back the log. Those
-    ``also`` driven, by ids, come after the ego, beside the others.
+    ``also`` driven, by ids, come after the ego, beside the others. ``onward`` says how traffic goes on where the log
+    ends before the duration: who enters then is driven by the agent if everyone is, else by the background's rule;
+    without either nobody enters.
     """
 
     count: int
@@ -49,6 +52,7 @@ class Crowd:
     background: bool = False
     along_routes: bool = False
     also: tuple[int, ...] = ()
+    onward: Onward | None = None
 
     def choose(self, segment: RunSegment, graph: LaneGraph) -> tuple[Indices, Indices]:
         """Rows of A: those that the agent drives, the ego first, and background agents.
@@ -118,9 +122,22 @@ class CrowdDataset(SceneDataset):
         build = partial(CrowdDataset, routes=self.routes, duration=self.duration, keep=self.keep)
         return build, (self.store, self.crowd, self.dynamics, self.indices)
 
+    def segment(self, i: int) -> RunSegment:
+        """The run segment behind item ``i``, up to the duration, if need be past its log."""
+        segment, crowd = self.store[self.indices[i]], self.crowd
+        steps = round(self.duration / segment.dt) + 1
+        if crowd.onward is None or segment.num_steps >= steps:
+            return super().segment(i)
+        enter = crowd.everyone or crowd.background
+        return crowd.onward.extended(segment, self.graph(i), steps, enter=enter)
+
     def _scene(self, i: int) -> SceneBatch:
         segment, graph = self.segment(i), self.graph(i)
-        driven, background = self.crowd.choose(segment, graph)
+        log = self.store[self.indices[i]] if segment.logged else segment
+        driven, background = self.crowd.choose(log, graph)
+        later = np.arange(log.num_agents, segment.num_agents)
+        driven = np.append(driven, later[: len(later) * self.crowd.everyone])
+        background = np.append(background, later[len(later) * self.crowd.everyone :])
         return scene(
             segment,
             np.concatenate([driven, background]).tolist(),
@@ -149,8 +166,11 @@ def crowd_dataset(
         warnings.warn(f"{store.path} {store.unfinished}", DataWarning, stacklevel=2)
     everyone, rule = config.interactive == "all", config.others != "log"
     count = MOST if config.interactive == "all" else config.interactive or default or agent.interactive
-    in_open = config.open_traffic or everyone or rule
-    crowd = Crowd(count, everyone, config.radius, in_open, rule, config.others == "idm", tuple(also))
+    in_open, onward = config.open_traffic or everyone or rule, None
+    if isinstance(config, SimulateConfig):
+        in_open = in_open or config.after_collision in ("remove", "respawn")
+        onward = Onward(config.inflow, config.lights, config.seed) if config.duration and in_open else None
+    crowd = Crowd(count, everyone, config.radius, in_open, rule, config.others == "idm", tuple(also), onward)
     seconds, keep = config.duration or agent.duration, config.batch or TOGETHER
     routes = agent.routed or routes
     return CrowdDataset(store, crowd, agent.dynamics, indices, routes=routes, duration=seconds, keep=keep)

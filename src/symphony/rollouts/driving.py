@@ -16,7 +16,7 @@ from symphony import keys
 from symphony.agents import Agent
 from symphony.collectors import Backtrack, BeamSearchResult, KeepAll, PruningRule, max_then_sum
 from symphony.config import EvaluateConfig
-from symphony.config.evaluation import Search
+from symphony.config.evaluation import Search, SimulateConfig
 from symphony.envs.dynamics import Bicycle, ConstantVelocity
 from symphony.envs.flags import offroad_flags
 from symphony.envs.scene import SceneBatch
@@ -98,7 +98,8 @@ def simulation(
     ):
         raise ConfigError("beside log playback those with a planner are the only interactive agents")
     agent.check_step(float(scenes.dt[0]))
-    env = PlannedEnv(scenes, agent.dynamics, agent.observation)
+    after = config.after_collision if isinstance(config, SimulateConfig) else "go-on"
+    env = PlannedEnv(scenes, agent.dynamics, agent.observation, after_collision=after)
     kind, trees, branches, taken, settings = agent.plan(config)
     searches = kind not in ("none", "log")
     guard = NaNGuard(env, policy, [keys.LOGITS, keys.ACTION], "policy")

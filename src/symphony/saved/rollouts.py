@@ -94,6 +94,11 @@ class SavedRollouts:
         first = self.counted[:, :1] & self.segment.valid[self.agents, self.start]
         return np.concatenate([first, self.counted], 1)
 
+    def logged(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """[rows, T + 1] where the log has agents at the simulated states."""
+        within = np.arange(self.start, self.last + 1)
+        return self.segment.valid[rows][:, within] & (within < self.segment.log_steps)
+
     @cached_property
     def log_height(self) -> NDArray[np.float32]:
         """See :func:`symphony.data.levels.agent_heights`."""

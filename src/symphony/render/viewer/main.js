@@ -86,7 +86,8 @@ function choose(rollout) {
   $("eventcount").textContent = view.events.length ? `(${view.events.length})` : "";
   $("events").innerHTML = (r.failed[rollout] ? `<li class="fault">broke off: ${escapeText(r.failed[rollout])}</li>` : "") +
     (view.events.map((e, i) => `<li tabindex="0" data-event="${i}"><time>${(e.step * r.dt).toFixed(1)} s</time><span>${eventText(r, e)}</span></li>`).join("") || "<span class=hint>none in this rollout</span>");
-  $("ticks").innerHTML = view.events.map(e => `<i class="${e.kind}" style="left:${100 * e.step / r.steps}%"></i>`).join("");
+  $("ticks").innerHTML = view.events.map(e => `<i class="${e.kind}" style="left:${100 * e.step / r.steps}%"></i>`).join("") +
+    (r.log_end < r.steps ? `<i class="logend" title="end of the log" style="left:${100 * r.log_end / r.steps}%"></i>` : "");
   $("branch").textContent = "Click a branch to see where it went and what became of it.";
   if (search) $("searchfacts").textContent = `tree ${search.treeOf(rollout)}: ${r.branches} branches, pruned every ${(r.prune_every * r.dt).toFixed(1)} s`;
   remember(); dirty = true;
@@ -197,7 +198,7 @@ function frame(now) {
       paint();
       $("time").value = view.t;
       const r = scene.replay;
-      $("clock").textContent = `${(view.t * r.dt).toFixed(1)} / ${(r.steps * r.dt).toFixed(1)} s`;
+      $("clock").textContent = `${(view.t * r.dt).toFixed(1)} / ${(r.steps * r.dt).toFixed(1)} s${view.t > r.log_end ? ", past the log" : ""}`;
       $("follow").value = view.follow === null ? "" : view.follow;
       document.querySelectorAll("#events li[data-event]").forEach(li => li.classList.toggle("now", Math.abs(view.events[li.dataset.event].step - view.t) * r.dt < 0.5));
       whoPanel(); scaleBar();

@@ -212,12 +212,15 @@ def packed_log(saved: SavedRollouts) -> str:
         "ego": int(segment.ego),
         "ids": [str(number) for number in segment.agent_id.tolist()],
         "steps": saved.steps,
+        "log_end": segment.log_steps - 1 - saved.start,
     }
     heading, velocity = segment.heading[:, within], segment.velocity[:, within]
     speed = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
     place = segment.position[:, within, :2]
     packer.states("log", np.concatenate([place, heading[..., None], speed[..., None]], -1))
-    packer.add("log.valid", "u8", segment.valid[:, within])
+    seen = segment.valid[:, within].copy()
+    seen[saved.agents] = saved.logged(saved.agents)
+    packer.add("log.valid", "u8", seen)
     packer.add("size", "i16", segment.size[:, :2], CENTIMETRE)
     packer.add("type", "u8", segment.agent_type)
     for axis, letter in enumerate("xy"):
