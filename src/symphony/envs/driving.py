@@ -159,9 +159,7 @@ class DrivingEnv(EnvBase):
         # Read here, once: a step or a search must not wait for the device to tell.
         self.dt = float(scenes.dt[0])  # seconds per step, that of the scenes
         self.decisions = int(scenes.last_step.max())  # actions until the longest scene's last step
-        self.past_log = bool(
-            (scenes.last_step > scenes.log_end).any()
-        )  # whether some scene goes on past its log
+        self.past_log = bool((scenes.last_step > scenes.log_end).any())  # whether some scene is longer
         drawn_open = self.source is not None and self.source.open_traffic
         self.open_traffic = drawn_open or scenes.open_traffic  # whether agents enter and leave
         if (self.open_traffic, self.dt if isinstance(self.dynamics, Displacement) else before[1]) != before:
