@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
-from symphony.config import EvaluateConfig, Method
+from symphony.config import METHODS, EvaluateConfig
 from symphony.evaluation.records import evaluation_name, keep_evaluation
 from symphony.evaluation.table import METRICS, Entry
 
-METHODS = get_args(Method)
 CONFIG = asdict(EvaluateConfig())
 CONFIG |= {"search": "none", "score": "discriminator", "goals": "tree", "trees": 0, "rule": ""}
 CONFIG |= {"interactive": 2, "metric": []}

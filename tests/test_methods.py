@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDictBase
@@ -29,12 +30,13 @@ from symphony.errors import ConfigError
 from symphony.learning import SearchReplay, transitions
 from symphony.learning.demonstrations import SceneDataset
 from symphony.learning.experts import logged
+from symphony.learning.replay import COLLIDED, MEMORY, OFF_ROAD, PRICE, advantages
 from symphony.recipes import train
 from symphony.training import Trainer
 from symphony.training.logging import read_metrics
 
 NETWORKS = {"bc": {"policy"}, "bc_h": {"policy", "goals"}, "bc_ts": {"policy", "discriminator"}}
-NETWORKS["bc_ts_h"] = {"policy", "goals", "discriminator"}
+NETWORKS |= {"bc_rl_h": NETWORKS["bc_h"], "bc_ts_h": {"policy", "goals", "discriminator"}}
 METHODS: tuple[Any, ...] = tuple(NETWORKS)
 ROUTED = ObservationConfig(num_objects=4, num_points=12, route=True)
 Trained = Callable[..., Path]
@@ -92,8 +94,12 @@ def test_each_method_trains_its_networks_and_tells_of_them(trained, store, tmp_p
         for r in records if name in NETWORKS[method] else ():
             assert math.isfinite(r[f"loss_{name}"])
             assert r[f"gradient_norm_{name}"] > 0
-    # Who searches learns from the survivors.
-    assert ("policy_nll_rollout" in records[0]) == ("search_offroad_kept" in records[0]) == ("ts" in method)
+    # Who simulates learns from that, too.
+    assert (
+        ("policy_nll_rollout" in records[0])
+        == ("search_offroad_kept" in records[0])
+        == (method not in {"bc", "bc_h"})
+    )
 
 
 def test_the_seed_decides_the_weights(trained: Trained, store: Path, tmp_path: Path) -> None:
@@ -264,6 +270,44 @@ def test_what_is_searched_is_what_is_imitated(store: Path, tmp_path: Path) -> No
     stepped = env.step(env.at(before).set(keys.ACTION, before[keys.ACTION]))["next"]
     assert torch.equal(stepped[keys.STATE], after[keys.STATE])
     assert torch.equal(stepped[keys.GOAL], after[keys.GOAL])
+
+
+def test_blame_is_what_came_of_an_action_beyond_the_mean_of_the_other_branches(store, tmp_path):
+    search = SearchConfig(branches=4, prune_every=4, updates=2, states=8)
+    trainer = build(tiny("bc_rl_h", store, tmp_path, segments=3, search=search))
+    trainer._update(0)
+    replay = pieces(trainer)["replay"]
+    env, leaves = replay.env, replay.leaves.clone()
+    rng = np.random.default_rng(0)
+    for key in (keys.COLLISION, keys.OFFROAD):  # of one sort or another, not what happens to be
+        bad = rng.random(leaves["next", key].shape) < 0.2
+        leaves["next", key] = torch.from_numpy(bad)
+    found, fade = advantages(env, leaves), math.exp(-env.dt / MEMORY)
+    there = leaves[keys.VALID] & (leaves[keys.STEP] < env.scenes.last_step[leaves[keys.SCENE]])
+    to_go, counts = np.zeros(found.shape), np.zeros(found.shape, bool)
+    for b, s, n in np.ndindex(found.shape[0], 4, found.shape[-1]):
+        for first in range(found.shape[2]):
+            for t in range(first, found.shape[2]):
+                if there[b, s, t, n]:
+                    hit, off = (
+                        leaves["next", key][b, s, t, n, 0].item() for key in (keys.COLLISION, keys.OFFROAD)
+                    )
+                    to_go[b, s, first, n] -= fade ** (t - first) * (COLLIDED * hit + OFF_ROAD * env.dt * off)
+                    if hit:
+                        break
+        hits = leaves["next", keys.COLLISION][b, s, :, n, 0] & there[b, s, :, n]
+        counts[b, s, :, n] = (there[b, s, :, n] & (hits.cumsum(0) - hits.long() == 0)).numpy()
+    for b, s, t, n in np.ndindex(found.shape):
+        others = [k for k in range(4) if k != s and counts[b, k, t, n]]
+        mean = np.mean(to_go[b, others, t, n]) if others else to_go[b, s, t, n]
+        expected = (to_go[b, s, t, n] - mean) * counts[b, s, t, n]
+        assert found[b, s, t, n].item() == pytest.approx(expected, abs=1e-5)
+    # Drawn with weights, their mean is that over all.
+    replay._leaves = leaves
+    many = replay.blamed(20_000, torch.Generator().manual_seed(0), ObservationConfig.nothing())
+    assert many[keys.WEIGHT].abs().mean().item() == pytest.approx(PRICE * found.abs().mean().item(), rel=0.05)
+    worst = found.abs().amax(-1).flatten()
+    assert (many[keys.WEIGHT].abs().amax(-1) <= PRICE * worst.mean() * 1.001).all()
 
 
 @pytest.mark.parametrize(("method", "per"), [("bc_ts_h", "tree"), ("bc_ts_h", "branch"), ("mgail_h", "tree")])

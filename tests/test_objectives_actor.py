@@ -82,6 +82,21 @@ def test_distillation_is_one_bc_loss_per_kind(continuous, reduction):
         torch.testing.assert_close(out[name], bc(td, expert, name))
 
 
+def test_weights_of_rollouts_make_a_policy_gradient():
+    """The loss is linear in them; experts have none, and 1 is none."""
+    td, loss = batch(30), DistillationLoss(categorical_actor())
+    weight, plain = torch.randn(td[VALID].shape), loss(td)["loss_distillation"]
+    weighted = [
+        loss(td.clone().set(("agents", "weight"), w))["loss_distillation"] for w in (0 * weight + 1, weight)
+    ]
+    torch.testing.assert_close(weighted[0], plain)
+    rollout = td[VALID] & td[ROLLOUT]
+    each = DistillationLoss(categorical_actor(), reduction="none")(td)["loss_distillation"]
+    torch.testing.assert_close(weighted[1], plain + ((weight - 1) * each)[rollout].mean())
+    with pytest.raises(ValueError, match="weight"):
+        loss(td.clone().set(("agents", "weight"), weight[:, :1]))
+
+
 def test_more_rollouts_weigh_no_more_and_a_kind_that_is_absent_adds_nothing():
     td = batch(20)
     rollouts = td[td[ROLLOUT][:, 0]]

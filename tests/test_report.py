@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 from helpers_saved import played, searched
 from helpers_segments import LANE_WIDTH, crossing, make_road, make_segment, straight_road
 from helpers_store import fill
-from helpers_table import METHODS, make_entry, make_record, make_run
+from helpers_table import make_entry, make_record, make_run
 from symphony.cli import main
+from symphony.config import METHODS
 from symphony.data.builtin import builtin_store
 from symphony.data.segment import AgentType, Polylines, RunSegment, SignalState
 from symphony.data.sources.womd import WomdReader

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import torch
@@ -26,7 +26,7 @@ from symphony.agents import build_agent, load_agent, observation_of
 from symphony.agents.checkpoint import checkpoints
 from symphony.cli import main
 from symphony.cli import recipe as recipes
-from symphony.config import METHODS, AgentConfig, AgentSpec, TrainConfig, read_json, to_json
+from symphony.config import METHODS, AgentConfig, AgentSpec, Method, TrainConfig, read_json, to_json
 from symphony.config.files import from_dict
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, DrivingEnv, ObservationConfig
@@ -185,6 +185,7 @@ def test_configurations_are_read_back_strictly(store: Path, tmp_path: Path) -> N
 
 
 SOURCE = Path(symphony.__file__).parent
+RECIPES = get_args(Method)
 SCRIPTS = Path(__file__).parents[1] / "recipes"
 MAY_NAME_METHODS = ("recipes", "cli", "config")
 ROWS_OF_TABLES = ("formats.py", "paper.py", "relations.py", "table.py")
@@ -196,8 +197,8 @@ def modules() -> list[Path]:
 
 
 def test_there_is_a_recipe_for_every_method_and_the_file_that_one_opens_is_the_one_that_runs() -> None:
-    assert {path.stem for path in modules()} == set(METHODS)
-    for name in METHODS:
+    assert {path.stem for path in modules()} == set(RECIPES)
+    for name in RECIPES:
         recipe = recipe_of(name)
         assert (recipe.__module__, recipe.__name__) == (f"symphony.recipes.{name}", name)
     assert SCRIPTS.is_dir()
@@ -224,7 +225,7 @@ def test_a_recipe_is_one_function_that_can_be_read_at_once(path: Path) -> None:
 
 def test_nothing_below_the_recipes_names_a_method() -> None:
     """Nor looks which it is."""
-    word = re.compile(rf"""config\.method\b|["'](?:{"|".join(METHODS)})["']|endswith\("_h"\)""")
+    word = re.compile(rf"""config\.method\b|["'](?:{"|".join(RECIPES)})["']|endswith\("_h"\)""")
     found, looked = [], 0
     for path in sorted(SOURCE.rglob("*.py")):
         where = path.relative_to(SOURCE)
@@ -245,7 +246,7 @@ SEARCH = (
 )
 ADVERSARIAL = "--mgail.regression 1 --mgail.head-start 1 --mgail.rollouts 2"
 ARGUMENTS = {"bc": COMMON, "bc_h": COMMON}
-ARGUMENTS |= dict.fromkeys(("bc_ts", "bc_ts_h"), f"{COMMON} {SEARCH} --checkpoint-every 2")
+ARGUMENTS |= dict.fromkeys(("bc_ts", "bc_ts_h", "bc_rl_h"), f"{COMMON} {SEARCH} --checkpoint-every 2")
 ARGUMENTS |= dict.fromkeys(
     ("mgail", "mgail_h", "mgail_ts", "mgail_ts_h"), f"{ARGUMENTS['bc_ts']} {ADVERSARIAL}"
 )
@@ -266,7 +267,7 @@ def run_script(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Pat
     return run
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", RECIPES)
 def test_recipe(run_script: Any, tmp_path: Path, method: str, capsys: pytest.CaptureFixture[str]) -> None:
     for split, seed in (("train", 0), ("test", 1)):
         fill(tmp_path / split, [straight_road(4, seed=seed, steps=8), crossing(4, seed=seed, steps=8)])

@@ -13,11 +13,13 @@ from symphony.config.agent import ActionSpace, AgentConfig, AgentSpec, Discrimin
 from symphony.config.checks import Bounds, Count, Natural, NotNegative, Positive, Settings
 from symphony.keys import SEEN
 
-Method = Literal["bc", "bc_h", "bc_ts", "bc_ts_h", "mgail", "mgail_h", "mgail_ts", "mgail_ts_h"]
-"""Rows of the paper's tables, each with a recipe of its name: behavioural cloning or adversarial imitation through
-the model (MGAIL), with goals (H: hierarchy), with tree search (TS), with both.
+Row = Literal["bc", "bc_h", "bc_ts", "bc_ts_h", "mgail", "mgail_h", "mgail_ts", "mgail_ts_h"]
+"""Rows of the paper's tables: behavioural cloning or adversarial imitation through the model (MGAIL), with goals (H:
+hierarchy), with tree search (TS), with both.
 """
-METHODS: tuple[str, ...] = get_args(Method)
+METHODS: tuple[str, ...] = get_args(Row)
+Method = Literal[Row, "bc_rl_h"]
+"""What there is a recipe for: also BC+H with a policy gradient (RL), which is none of the paper's."""
 Cost = Literal["log_d", "non_saturating", "logit"]
 GOALS = 128
 """Expert routes per update of the goal policy."""
@@ -118,7 +120,8 @@ class RunConfig(Settings):
 class TrainConfig(RunConfig):
     """Train agents."""
 
-    #: Method to train: behavioural cloning or MGAIL, with goals (h), with tree search (ts), with both.
+    #: Method to train: behavioural cloning or MGAIL, with goals (h), with tree search (ts), with both; `bc_rl_h`:
+    #: cloning and a policy gradient against collisions in closed loop, for an agent that drives (--warm-start).
     method: Positional[Method]
     #: Seconds of each run segment that are used (the paper: 10 and 20; 0: all there are).
     duration: Natural = 0

@@ -5,8 +5,13 @@ Legend: B scenes, S branches, T steps, N agents, K states drawn.
 
 from __future__ import annotations
 
+import math
+
 import torch
+from jaxtyping import Float
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.objectives.value.functional import reward2go
 
 from symphony import keys
 from symphony.collectors import BeamSearchCollector
@@ -24,7 +29,12 @@ _LEARNED = (
     keys.VALID,
     keys.ACTION,
     keys.ROLLOUT,
+    keys.WEIGHT,
 )
+COLLIDED, OFF_ROAD, MEMORY = 1.0, 0.5, 2.0
+"""What a collision costs, and a second off the road; seconds over which an action is to blame for it (1 / e)."""
+PRICE = 60.0
+"""Weight of the policy gradient beside cloning."""
 
 
 class SearchReplay:
@@ -83,6 +93,29 @@ class SearchReplay:
         batch.set(keys.ACTION, chosen.get(keys.ACTION))
         return batch.set(keys.ROLLOUT, torch.ones_like(valid))
 
+    def blamed(self, count: int, rng: torch.Generator, observation: ObservationConfig) -> TensorDict:
+        """States of rollouts and what was done in them, drawn as often as it matters, with weights for a policy
+        gradient: of a search that keeps all branches.
+
+        Args:
+            count: K.
+            rng: of the draw.
+            observation: what the policy observes.
+
+        Returns:
+            TensorDict [K, N]: observation, ``ACTION``, ``ROLLOUT`` (True), ``WEIGHT`` (see :func:`advantages`).
+        """
+        found = advantages(self.env, self.leaves)
+        share = found.abs().amax(-1)
+        pick = torch.multinomial(share.flatten().clamp_min(1e-9), count, replacement=True, generator=rng)
+        chosen = self.leaves.flatten()[pick]
+        batch = DrivingEnv(self.env.scenes, self.env.dynamics, observation).at(chosen)
+        batch.set(keys.ACTION, chosen.get(keys.ACTION))
+        # Divided by how likely each was drawn: the mean is that over all states.
+        weight = found.flatten(0, -2)[pick] * (share.mean() / share.flatten()[pick].clamp_min(1e-9))[:, None]
+        batch.set(keys.ROLLOUT, torch.ones_like(batch.get(keys.VALID)))
+        return batch.set(keys.WEIGHT, PRICE * weight)
+
     def both_kinds(self, rng: torch.Generator) -> TensorDict:
         """Simulated states, pruned ones included, and logged states of the same scenes.
 
@@ -139,13 +172,28 @@ class SearchReplay:
 def with_survivors(experts: TensorDict, rollouts: TensorDict) -> TensorDict:
     """One batch [M, 1] of expert states [K, 1] and rollout states [L, N], told apart by ``ROLLOUT``."""
     valid = experts.get(keys.VALID)
-    experts.set(keys.ROLLOUT, torch.zeros_like(valid))
-    present = [key for key in _LEARNED if experts.get(key, None) is not None]
+    experts.set(keys.ROLLOUT, torch.zeros_like(valid)).set(keys.WEIGHT, torch.ones_like(valid).float())
+    present = [key for key in _LEARNED if key in experts.keys(True) and key in rollouts.keys(True)]
     flat = TensorDict(
         {key: rollouts.get(key).flatten(0, 1)[:, None] for key in present},
         batch_size=[rollouts.get(keys.VALID).numel()],
     )
     return torch.cat([experts.select(*present), flat])
+
+
+def advantages(env: DrivingEnv, rollouts: TensorDictBase) -> Float[Tensor, "B S T N"]:
+    """How much better than in the other branches it went on after each action: less a first collision and time off
+    the road, discounted; 0 after the collision, and where nobody is.
+    """
+    scene, step = rollouts.get(keys.SCENE).squeeze(-1), rollouts.get(keys.STEP).squeeze(-1)
+    there = rollouts.get(keys.VALID) & (step < env.scenes.last_step[scene])[..., None]
+    hit, off = (rollouts.get(("next", *key)).squeeze(-1) & there for key in (keys.COLLISION, keys.OFFROAD))
+    reward = -(COLLIDED * hit + OFF_ROAD * env.dt * off)
+    to_go = reward2go(reward, hit, math.exp(-env.dt / MEMORY))
+    there = there & (hit.cumsum(2) - hit.long() == 0)
+    total, others = (to_go * there).sum(1, keepdim=True), there.sum(1, keepdim=True) - 1
+    mean = (total - to_go) / others.clamp_min(1)
+    return (to_go - mean) * (there & (others > 0))
 
 
 def search_statistics(env: DrivingEnv, leaves: TensorDictBase) -> TensorDict:

@@ -301,7 +301,8 @@ class DistillationLoss(ActorLoss):
     """Likelihood of expert actions and of actions in rollouts that survived a search (paper, III).
 
     The mean negative log-likelihood over the valid expert entries plus that over the valid rollout entries: each
-    kind has its own mean, so the balance does not depend on how many of each a batch holds.
+    kind has its own mean, so the balance does not depend on how many of each a batch holds. With weights, such as
+    advantages, those of rollouts are a policy gradient.
 
     Args:
         actor_network: probabilistic module with a `get_dist`, over discrete or continuous actions.
@@ -328,11 +329,13 @@ class DistillationLoss(ActorLoss):
             action (NestedKey): the action to imitate.
             valid (NestedKey): bool mask, True where an agent counts.
             rollout (NestedKey): bool, True where the action comes from a rollout, False where from an expert.
+            weight (NestedKey): of each rollout entry; 1 where a batch has none.
         """
 
         action: NestedKey = ("agents", "action")
         valid: NestedKey = ("agents", "valid")
         rollout: NestedKey = ("agents", "rollout")
+        weight: NestedKey = ("agents", "weight")
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -359,10 +362,13 @@ class DistillationLoss(ActorLoss):
         shape = fit.counted.shape
         rollout = self._flags(tensordict, self.tensor_keys.rollout, "rollout flag", shape)
         expert, rollout = fit.counted & ~rollout, fit.counted & rollout
+        cost = fit.cost
+        if tensordict.get(self.tensor_keys.weight, None) is not None:
+            cost = cost * self._entries(tensordict, self.tensor_keys.weight, "weight", shape)
         reduction: Reduction = "none" if self.reduction == "none" else "mean"
         result = TensorDict(
             {
-                "loss_distillation": self._reduced(fit.cost, expert) + self._reduced(fit.cost, rollout),
+                "loss_distillation": self._reduced(fit.cost, expert) + self._reduced(cost, rollout),
                 "nll_expert": self._reduced(fit.nll, expert, reduction),
                 "nll_rollout": self._reduced(fit.nll, rollout, reduction),
                 **self._statistics(fit, expert),

@@ -1,0 +1,67 @@
+"""Behavioural cloning with goals, and a policy gradient against collisions in closed loop: no row of the paper's.
+
+Made for an agent that drives already (`--warm-start`), with rollouts of eight branches that nothing prunes.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictSequential
+
+from symphony import DistillationLoss, DrivingEnv, GoalLoss, SegmentStore, TrainConfig
+from symphony.agents import Agent, bicycle, goal_network, observation_of, policy_network
+from symphony.collectors import BeamSearchCollector, KeepAll, with_rows
+from symphony.config.training import GOALS
+from symphony.learning import SceneDataset, SearchReplay, with_survivors
+from symphony.modules import SeededNoise
+from symphony.rollouts.search import collector_settings, realism_score, with_drawn_goals
+from symphony.training import Phase, Processes, Trainer, Updates, cosine
+
+
+def bc_rl_h(config: TrainConfig, processes: Processes) -> Trainer:
+    """Imitate the log, and make what led to collisions and off the road less likely than what did not."""
+    torch.manual_seed(config.seed)
+    seed, rng, device = processes.seed(config.seed), torch.Generator(), processes.device
+    store, dynamics = SegmentStore(config.data), bicycle(config.agent)
+    data = SceneDataset(store, dynamics=dynamics, routes=True, **config.scenes)
+
+    # Networks.
+    spec = config.spec("bicycle", data.dt, goals=True)
+    policy, goals = policy_network(spec), goal_network(spec)
+    agent = Agent(str(config.out), policy, spec, goals).to(device)
+
+    # Environment and collector: all branches go on, with goals of their own.
+    env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=device)
+    collector = BeamSearchCollector(
+        with_rows(env, [min(config.segments, len(data))]),
+        TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
+        score=realism_score(env, None, score="flags"),
+        rule=KeepAll(),
+        prepare=lambda start: with_drawn_goals(env, goals, start, seed, config.search.goals),
+        **collector_settings(config.search, env, seed, data, config.segments),
+    )
+    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
+
+    # Losses and optimizers.
+    policy_loss = processes.wrap_ddp(DistillationLoss(policy))
+    goal_loss = processes.wrap_ddp(GoalLoss(goals))
+    optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
+    rates = config.rates(optimizers)
+
+    # The order of updates.
+    def update(step: int) -> Updates:
+        items, observation = data.draw(config.segments, rng), observation_of(spec)
+        yield "search", replay.refresh(step)
+        experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
+        rollouts = replay.blamed(config.search.states, rng, observation)
+        yield "policy", policy_loss(with_survivors(experts, rollouts))
+        yield "goals", goal_loss(data.sample_goals(items, GOALS, observation, rng, device))
+
+    phases = [Phase(config.steps, update, cosine(rates, config.steps))]
+    return Trainer(config, agent, data, phases, optimizers, rng, processes, replay)
+
+
+if __name__ == "__main__":
+    from symphony.cli.recipe import main
+
+    main(bc_rl_h, __doc__)
