@@ -39,10 +39,12 @@ from symphony.envs.dynamics import RandomActions
 from symphony.learning import SceneDataset
 from symphony.modules import ElementGroup, SceneEncoder, SceneNetwork, SeededNoise, discrete_policy, mlp
 from symphony.modules.encoder import scene_module
+from symphony.render.style import AGENT_COLORS, new_figure, save
 from symphony.rollouts import RouteGoals
 
 ROOT = Path(__file__).resolve().parents[1]
 RUNS, RECORD = ROOT / "out" / "reinforcement", ROOT / "results" / "reinforcement.json"
+FIGURE = ROOT / "docs" / "reinforcement.png"
 METHODS, SEEDS, BATCHES, SHOWN = ("ppo", "sac"), range(3), 200, (0, 90, 180)
 """Twenty batches from each of the last on are shown."""
 ROWS, STEPS, OBJECTS = 32, 8, 6
@@ -218,8 +220,21 @@ def record(runs: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
     }
 
 
+def curves(runs: dict[str, list[dict[str, Any]]], path: Path) -> None:
+    """Draw metres per crash over the ten batches up to each, a line for each seed."""
+    axes = (figure := new_figure(7, 3)).subplots()
+    for color, (name, found) in zip(AGENT_COLORS, runs.items(), strict=False):
+        for k, one in enumerate(found):
+            metres, crashes = torch.tensor(one["batches"]).unfold(0, 10, 1).sum(-1).unbind(-1)
+            label = name.upper() if k == 0 else None
+            axes.plot(range(10, len(metres) + 10), metres / crashes.clamp_min(1), color=color, label=label)
+    axes.set(xlabel="batches of 256 steps", ylabel="metres per crash, of ten batches")
+    axes.legend()
+    save(figure, path)
+
+
 def main() -> None:
-    """Do the runs that are not there yet, and write the record."""
+    """Do the runs that are not there yet, write the record, and draw the curves."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -232,6 +247,7 @@ def main() -> None:
     if not only:
         runs = {m: [json.loads((RUNS / f"{m}-{s}.json").read_text()) for s in SEEDS] for m in METHODS}
         RECORD.write_text(json.dumps(record(runs), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        curves(runs, FIGURE)
 
 
 if __name__ == "__main__":

@@ -112,6 +112,10 @@ def test_reinforcement_learning_is_recorded(program: Any, tmp_path: Path, monkey
             0 < m < 2560 * 8 and 0 <= crashes <= 256 for m, crashes in (*one["batches"], one["unseen"])
         )
         assert one != other
+    learning.curves(
+        {m: [one | {"batches": one["batches"] * 10} for one in runs[m]] for m in runs}, tmp_path / "a.png"
+    )
+    assert (tmp_path / "a.png").stat().st_size > 5000
     record = learning.record(runs)
     assert [len(row) for row in record["rows"]] == [len(record["columns"])] * 4
 
