@@ -323,7 +323,7 @@ def test_doctor_simulates_and_says_what_is_there(capsys: pytest.CaptureFixture[s
     found = json.loads(capsys.readouterr().out)
     assert found["simulation"]["rollouts"] == 2
     assert found["packages"]["torch"]
-    assert set(found["extras"]) == {"eclipse-sumo", "pyarrow", "ray", "imageio-ffmpeg", "gymnasium"}
+    assert set(found["extras"]) == {"eclipse-sumo", "pyarrow", "ray", "imageio-ffmpeg", "gymnasium", "mcap"}
 
 
 @cache

@@ -32,7 +32,7 @@ from symphony.data.segment import RoadMap, RunSegment, SignalState, content_hash
 from symphony.data.selection import MOVING, exclusion, interactive_agents, travel
 from symphony.data.sources import sumo
 from symphony.data.sources.sumo import process
-from symphony.data.sources.sumo.networks import own_network, town
+from symphony.data.sources.sumo.networks import own_network, slow_bends, town
 from symphony.data.sources.sumo.roads import read_network
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
@@ -395,6 +395,58 @@ def test_traffic_of_ours_drives_on_opendrive(tmp_path: Path) -> None:
     file.write_bytes(file.read_bytes() + b"\n")
     with pytest.raises(ConfigError, match="made with roads"):
         generate(plans["a"], tmp_path / "a")
+
+
+XODR = """<OpenDRIVE xmlns="http://code.asam.net/simulation/standard/opendrive_schema">
+<header revMajor="1" revMinor="6"/><road id="7" junction="-1" length="250"><link/>
+<type s="0" type="town"><speed max="30" unit="mph"/></type><planView>{pieces}</planView>
+<lanes><laneSection s="0">{lanes}</laneSection><laneSection s="125">{lanes}</laneSection></lanes>
+<signals><signal id="1" s="60" t="-8" orientation="+" dynamic="yes" type="1000001" subtype="-1"/></signals>
+</road></OpenDRIVE>"""
+LANE = '<lane id="{0}" type="driving"><link>{2}</link><width sOffset="0" a="{1}" b="0" c="0" d="0"/></lane>'
+
+
+@needs_sumo
+def test_lanes_lie_where_opendrive_has_them(tmp_path: Path) -> None:
+    """A road of a line, clothoids and arcs, integrated apart: centres, widths, directions, the limit; no light where
+    nothing crosses, whatever stands there. Traffic of ours drives on it, though it has no junction.
+    """
+    knots, bend = [0, 60, 100, 170, 220, 250], [0, 0, 0.02, 0.02, -0.01, -0.01]
+    s = np.linspace(0, 250, 25_001)
+    turn = 0.3 + np.cumsum(np.interp(s, knots, bend)) * 0.01
+    way = np.stack([np.cos(turn), np.sin(turn)], -1)
+    place = np.array([500.0, -200.0]) + np.cumsum(way, 0) * 0.01
+    pieces = ""
+    for begin, end, *curves in zip(knots, knots[1:], bend, bend[1:], strict=False):
+        k, (first, last) = 100 * begin, curves
+        at = f's="{begin}" x="{place[k, 0]}" y="{place[k, 1]}" hdg="{turn[k]}" length="{end - begin}"'
+        shape = (
+            f'<spiral curvStart="{first}" curvEnd="{last}"/>'
+            if first != last
+            else f'<arc curvature="{first}"/>'
+        )
+        pieces += f"<geometry {at}>{shape if first or last else '<line/>'}</geometry>"
+    link = "".join(f'<{name} id="{{0}}"/>' for name in ("predecessor", "successor"))
+    made = {k: LANE.format(k, width, link.format(k)) for k, width in ((1, 3), (-1, 3.5), (-2, 3))}
+    lanes = f'<left>{made[1]}</left><center><lane id="0" type="none"/></center><right>{made[-1]}{made[-2]}</right>'
+    file = tmp_path / "bends.xodr"
+    file.write_text(XODR.format(pieces=pieces, lanes=lanes))
+    network = read_network(net := own_network(file, tmp_path))
+    assert network.speed == pytest.approx(30 * 0.44704, abs=0.01)
+    assert network.connectors == {}
+    left = np.stack([-way[:, 1], way[:, 0]], -1)
+    lanes_of = [(line, w) for line, w in zip(network.lanes, network.width, strict=True) if len(line) > 2]
+    for aside, width, sign in ((1.5, 3.0, -1), (-1.75, 3.5, 1), (-5.0, 3.0, 1)):
+        truth = shapely.LineString((place + aside * left)[::sign])
+        mine = [k for k in lanes_of if shapely.distance(truth, shapely.points(k[0])).max() < 0.03]
+        ahead = [truth.project(shapely.points(line)) for line, _ in mine]
+        assert all((np.diff(each) > 0).all() for each in ahead)
+        assert sum(map(np.ptp, ahead)) == pytest.approx(truth.length, abs=0.5)
+        assert [w for _, w in mine] == pytest.approx([width] * 2, abs=0.01)
+    slow_bends(net)
+    slow = [v for line, v in zip(network.lanes, read_network(net).speed, strict=True) if len(line) > 2]
+    assert max(slow) < np.sqrt(3.0 / 0.02) * 1.05
+    assert generate(Plan(1, kinds=(str(file),)), tmp_path / "store").complete
 
 
 OSM = """<osm version="0.6">

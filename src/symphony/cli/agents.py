@@ -25,7 +25,7 @@ PANELS, SHOWN, NAMED = 6, 8, 5
 BASELINES = {"log playback": "playback", "constant velocity": "constant_velocity"}
 """Agents of the demo by their titles, of which only the numbers are shown."""
 PACKAGES = "torch torchrl tensordict numpy shapely matplotlib wandb safetensors"
-EXTRAS = "eclipse-sumo pyarrow ray imageio-ffmpeg gymnasium"
+EXTRAS = "eclipse-sumo pyarrow ray imageio-ffmpeg gymnasium mcap"
 
 
 class Train(shared.Command):

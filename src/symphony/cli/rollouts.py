@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import field
 from pathlib import Path
@@ -170,27 +170,32 @@ class Export(shared.Command):
     """Write saved rollouts in a format of other tools, a file for each."""
 
     folder: shared.Saved
-    format: Literal["commonroad", "json"] = "commonroad"  # Format: CommonRoad scenarios (XML 2020a), or JSON.
+    #: Format: CommonRoad scenarios (XML 2020a), JSON, OpenSCENARIO (XML 1.2), or MCAP for Foxglove (extra `mcap`).
+    format: Literal["commonroad", "json", "openscenario", "mcap"] = "commonroad"
     out: shared.Folder = None  # Folder of the files; by default the folder `export` within SIM.
     segments: shared.Segments = ()
     #: Numbers of the rollouts to export of each run segment, counted from 0; by default all.
     rollouts: Annotated[tuple[int, ...], arg(metavar="K ...")] = ()
 
     def __call__(self) -> None:
-        from symphony.saved.export import commonroad, to_dict
-        from symphony.saved.folder import file_stem, load_rollouts
+        from symphony.saved import export, folder, foxglove, openscenario
 
-        folder, count, suffix, write = load_rollouts(self.folder), 0, "xml", commonroad
-        if self.format == "json":
-            suffix = "json"
-            write = lambda *of: json.dumps(to_dict(*of), ensure_ascii=False, allow_nan=False) + "\n"  # noqa: E731
+        held, count = folder.load_rollouts(self.folder), 0
+        writers: dict[str, tuple[Callable[..., str | bytes], str]] = {
+            "commonroad": (export.commonroad, "xml"),
+            "json": (export.as_json, "json"),
+            "openscenario": (openscenario.openscenario, "xosc"),
+            "mcap": (foxglove.mcap, "mcap"),
+        }
+        write, suffix = writers[self.format]
         with files.Lock((out := self.out or self.folder / "export") / "export.lock"):
-            for name in self.segments or folder.ids:
-                saved = folder.of(name)
+            for name in self.segments or held.ids:
+                saved = held.of(name)
                 for k in self.rollouts or range(saved.rollouts):
                     if not 0 <= k < saved.rollouts:
                         raise errors.ConfigError(f"{name} has rollouts 0 to {saved.rollouts - 1}, not {k}")
-                    text = write(saved, k)
-                    files.write_file(out / f"{file_stem(name)}-{k}.{suffix}", text)
+                    made = write(saved, k)
+                    with files.replacing(out / f"{folder.file_stem(name)}-{k}.{suffix}") as draft:
+                        draft.write_bytes(made if isinstance(made, bytes) else made.encode())
                     count += 1
         shared.say(f"written: {count} files in {out}")

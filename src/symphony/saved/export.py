@@ -5,6 +5,7 @@ Legend: A agents, U states, L lanes, Q lights. Coordinates are those of the sour
 
 from __future__ import annotations
 
+import json
 import re
 import xml.etree.ElementTree as ET
 import zlib
@@ -230,3 +231,8 @@ def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
     found: dict[str, Any] = {"segment": segment.segment_id, "rollout": rollout, "dt": float(segment.dt)}
     found |= {"steps": saved.steps, "failed": saved.failed.get(rollout), "agents": agents}
     return found | {"lights": lights, "map": plain}
+
+
+def as_json(saved: SavedRollouts, rollout: int) -> str:
+    """:func:`to_dict` as text."""
+    return json.dumps(to_dict(saved, rollout), ensure_ascii=False, allow_nan=False) + "\n"

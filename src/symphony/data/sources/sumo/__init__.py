@@ -12,11 +12,19 @@ import numpy as np
 
 from symphony.data.segment import RunSegment
 from symphony.data.sources.sumo.extract import DT, CropRule, crop_rule, cut_segments
-from symphony.data.sources.sumo.networks import NETWORKS, RAMP_RADIUS, freeway, is_own, kind_name, own_network
+from symphony.data.sources.sumo.networks import (
+    NETWORKS,
+    RAMP_RADIUS,
+    freeway,
+    is_own,
+    kind_name,
+    own_network,
+    slow_bends,
+)
 from symphony.data.sources.sumo.process import scratch, sumo_version
 from symphony.data.sources.sumo.roads import read_network
 from symphony.data.sources.sumo.traffic import simulate_traffic, write_demand
-from symphony.errors import ConfigError
+from symphony.errors import ConfigError, DataError
 
 __all__ = ["KINDS", "CropRule", "crop_rule", "generate_run", "is_own", "kind_name", "sumo_version"]
 
@@ -61,12 +69,17 @@ def generate_run(
         else:
             file = freeway(roads_rng, folder, longer) if ramp else NETWORKS[kind](roads_rng, folder)
         network = read_network(file)
-        # Where streets end at the edge of the map, traffic comes from there; else it circulates.
-        through = ramp or (own and bool(network.sources()))
+        if not network.lanes:
+            raise DataError("has no roads for cars", file=Path(kind))
+        if own:
+            slow_bends(file)
+        # On roads of one's own traffic comes from where streets begin at the edge of the map, and circulates.
+        through, around = ramp or (own and bool(network.sources())), not ramp
         sublane = bool(drive_rng.random() < SUBLANE_SHARE)
         warm_up = WARM_UP * (_OWN_FILLS if own else 1) + longer / _SLOW
         end = warm_up + duration
-        how = {"through": through, "sublane": sublane}
+        how = {"through": through, "around": around, "sublane": sublane}
         size = write_demand(network, demand_rng, folder, end, **how, straight=straight)
         traffic = simulate_traffic(file, network, size, drive_rng, end, warm_up, sublane=sublane)
-    return cut_segments(f"sumo-{kind_name(kind)}-{seed:06d}", network, traffic, cut_rng, rule)
+    found, reasons = cut_segments(f"sumo-{kind_name(kind)}-{seed:06d}", network, traffic, cut_rng, rule)
+    return [segment.replace(file=Path(kind).name) if own else segment for segment in found], reasons

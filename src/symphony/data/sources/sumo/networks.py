@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import re
 import shutil
+import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from symphony.data.sources.base import Doubles, located
+from symphony.data.sources.base import Doubles, load_xml, located, number
 from symphony.data.sources.sumo.process import run_program
+from symphony.data.sources.sumo.roads import densify, shape
 from symphony.errors import DataError
 
 COMMON = (
@@ -26,6 +28,7 @@ COMMON = (
 SHARPEST_ANGLE = 1.05  # radians between two streets at a junction, at least where one of them is bent
 LATERAL_ACCELERATION = 3.0
 """m/s² that the speed limits of curved streets allow for; drivers exceed limits by up to 30 %."""
+BEND = 2.0  # metres between the points of a lane at which it may bend
 RAMP_RADIUS = 190.0
 """Radius in metres of the largest map that fits between the ends of a freeway and of its ramps."""
 OWN_ROADS = {".xodr": "--opendrive-files", ".osm": "--osm-files", ".net.xml": "--sumo-net-file"}
@@ -161,7 +164,7 @@ def _comfortable_speed(line: Doubles) -> float:
     turn = np.diff(np.unwrap(np.arctan2(along[:, 1], along[:, 0])))
     step = np.linalg.norm(along, axis=-1)
     curvature = np.abs(turn) / ((step[:-1] + step[1:]) / 2)
-    return float(np.sqrt(LATERAL_ACCELERATION / max(curvature.max(), 1e-3)))
+    return float(np.sqrt(LATERAL_ACCELERATION / curvature.max(initial=1e-3)))
 
 
 def _rotation(angle: float) -> Doubles:
@@ -201,8 +204,8 @@ def town(rng: Random, folder: Path) -> Path:
         if link.b in rings:
             end, line = rings[link.b].enter(end, line[::-1])
             line = line[::-1]
-        for ends, shape in (((start, end), line), ((end, start), line[::-1])):
-            net.edge(ends, shape, (link.lanes, link.speed, width), 5 if link.arterial else 3)
+        for ends, points in (((start, end), line), ((end, start), line[::-1])):
+            net.edge(ends, points, (link.lanes, link.speed, width), 5 if link.arterial else 3)
     for ring in rings.values():
         ring.write(net, width + 0.8)
     layout = _signal_layout(rng)
@@ -366,13 +369,44 @@ def own_network(file: Path, folder: Path) -> Path:
         if not file.is_file():
             raise DataError("no such file")
         ending, option = next(entry for entry in OWN_ROADS.items() if file.name.endswith(entry[0]))
-        shutil.copyfile(file, folder / f"own{ending}")
-        arguments = f"{option} own{ending} --output-file net.net.xml {COMMON}"
-        arguments += " --keep-edges.by-vclass passenger --remove-edges.isolated true"
+        own = folder / f"own{ending}"
+        arguments = f"{option} {own.name} --output-file net.net.xml {COMMON} --keep-edges.by-vclass passenger"
         if ending == ".osm":
-            arguments += " --geometry.remove true --junctions.join true --tls.guess-signals true"
+            arguments += " --remove-edges.isolated true --geometry.remove true --junctions.join true"
+            arguments += " --tls.guess-signals true"
+        if ending == ".xodr":
+            # In the map's own coordinates, its turns as it has them.
+            arguments += " --offset.disable-normalization true --opendrive.internal-shapes true"
+            arguments += " --opendrive.curve-resolution 1 --tls.discard-simple true"
+            _limited(load_xml(file, "OpenDRIVE")).write(own)
+        else:
+            shutil.copyfile(file, own)
         run_program("netconvert", arguments, folder)
         return folder / "net.net.xml"
+
+
+def _limited(root: ET.Element) -> ET.ElementTree[ET.Element]:
+    """Return an OpenDRIVE map whose lanes without a speed limit have that of their road, which SUMO does not read."""
+    for node in root.iter():
+        node.tag = node.tag.rpartition("}")[2]
+    for road in root.iterfind("road"):
+        limits = [(number(kind.get("s"), "type"), kind.find("speed")) for kind in road.iterfind("type")]
+        for section in road.iterfind("lanes/laneSection"):
+            begin = number(section.get("s"), "laneSection")
+            limit = next((speed for at, speed in reversed(limits) if at <= begin), None)
+            for lane in section.iterfind("*/lane"):
+                if limit is not None and lane.find("speed") is None:
+                    lane.append(ET.Element("speed", limit.attrib, sOffset="0"))
+    return ET.ElementTree(root)
+
+
+def slow_bends(file: Path) -> None:
+    """Let SUMO drive the lanes of a network, which has limits for straight roads, as fast as their bends allow."""
+    tree = ET.parse(file)  # noqa: S314 - written by netconvert
+    for lane in tree.iterfind("edge/lane"):
+        line = densify(shape(lane.attrib["shape"]), BEND)
+        lane.set("speed", f"{min(float(lane.attrib['speed']), _comfortable_speed(line)):.2f}")
+    tree.write(file)
 
 
 NETWORKS: dict[str, Callable[[Random, Path], Path]] = {"town": town, "grid": grid, "ramp": freeway}

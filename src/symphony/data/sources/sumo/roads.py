@@ -43,7 +43,7 @@ class Network:
     connectors: dict[str, list[tuple[int, int, int]]]  # per light (link, connector it controls, lane before)
     stop_lanes: list[int]  # the rightmost lane of each edge that ends at a stop sign
     junction_shapes: list[Doubles]  # the paved area of each junction
-    centers: Doubles  # [J, 2] junctions where at least three streets meet or lanes split or join
+    centers: Doubles  # [J, 2] junctions where at least three streets meet or lanes split or join, or middles of roads
 
     def sources(self) -> list[int]:
         """Return the edges for traffic that nothing leads into."""
@@ -82,7 +82,8 @@ class Network:
         return first, last
 
 
-def _shape(text: str) -> Doubles:
+def shape(text: str) -> Doubles:
+    """Return the points [P, 2] of a shape in SUMO's words."""
     return np.array([[float(c) for c in p.split(",")[:2]] for p in text.split()])
 
 
@@ -102,7 +103,7 @@ def read_network(file: Path) -> Network:
         names.append(element.attrib["id"])
         for lane in element.iter("lane"):
             index[lane.attrib["id"]] = len(lanes)
-            lanes.append(_shape(lane.attrib["shape"]))
+            lanes.append(shape(lane.attrib["shape"]))
             width.append(float(lane.get("width", _DEFAULT_WIDTH)))
             speed.append(float(lane.attrib["speed"]))
             internal.append(element.get("function") == "internal")
@@ -120,14 +121,18 @@ def read_network(file: Path) -> Network:
             stops.add(edge.index(edge[start]))
     shapes, centers = [], []
     for junction in root.iter("junction"):
-        shape = _shape(junction.get("shape", ""))
-        if junction.get("type") == "internal" or len(shape) < 3:
+        outline = shape(junction.get("shape", ""))
+        if junction.get("type") == "internal" or len(outline) < 3:
             continue
-        shapes.append(shape)
+        shapes.append(outline)
         # Where streams of traffic cross, split or join. Sources and sinks are out of balance, but have no shape.
         crossing = any("1" in request.attrib["foes"] for request in junction.iter("request"))
         if crossing or balance[junction.attrib["id"]] != 0:
-            centers.append(shape.mean(0))
+            centers.append(outline.mean(0))
+    # Roads without a junction are seen from their middles.
+    centers = centers or [
+        line[len(line) // 2] for line, inner in zip(lanes, internal, strict=True) if not inner
+    ]
     return Network(
         lanes,
         np.array(width),
@@ -163,7 +168,7 @@ def crop_network(network: Network, center: Doubles, radius: float) -> Crop:
     """
     kept, lines, whole_end, whole_start = [], [], [], []
     for k, shape in enumerate(network.lanes):
-        local = _densify(shape - center, _CONNECTOR_SPACING if network.internal[k] else _LANE_SPACING)
+        local = densify(shape - center, _CONNECTOR_SPACING if network.internal[k] else _LANE_SPACING)
         away = np.linalg.norm(local, axis=-1)
         reach = radius
         if network.internal[k] and away.min() <= radius:
@@ -217,7 +222,7 @@ def crop_network(network: Network, center: Doubles, radius: float) -> Crop:
     )
 
 
-def _densify(line: Doubles, spacing: float) -> Doubles:
+def densify(line: Doubles, spacing: float) -> Doubles:
     """Return points at most ``spacing`` apart at equal arc lengths; the ends stay."""
     step = np.linalg.norm(np.diff(line, axis=0), axis=-1)
     keep = np.concatenate([[True], step > 1e-6])

@@ -73,13 +73,14 @@ def write_demand(
     duration: float,
     *,
     through: bool,
+    around: bool,
     sublane: bool,
     straight: float = 1.0,
 ) -> Floats:
     """Write vehicle types and vehicles, with routes that last for so many seconds, into the file :data:`ROUTES`.
 
-    If ``through``, traffic enters at the sources of the network during the whole run and leaves it at the end; else a
-    fixed number of vehicles starts everywhere and circulates. A route is a random walk that goes straight on at a
+    If ``through``, traffic enters at the sources of the network during the whole run and leaves it at the end; if
+    ``around``, a fixed number of vehicles starts everywhere. A route is a random walk that goes straight on at a
     junction so many times likelier than it takes one of the turns. Returns of vehicle k (its id in SUMO) the box [3].
     """
     types, sizes, shares = _types(rng, sublane)
@@ -92,21 +93,21 @@ def write_demand(
             turn = np.abs(np.angle(np.exp(1j * (first[after] - last[edge]))))
             weight = np.where(turn < _STRAIGHT, straight, 1.0)
             chance.append(weight / weight.sum() if len(after) else weight)
+    departs, starts, places = list[float](), list[int](), list[str]()
     if through:
         # Each lane carries 600-1 300 vehicles per hour.
-        departs, starts = [], []
         for edge in network.sources():
             flow = lanes[edge] * rng.uniform(600, 1300) / 3600
             times = np.cumsum(rng.exponential(1 / flow, int(flow * duration * 1.5) + 5))
             departs += times[times < duration].tolist()
             starts += [edge] * int((times < duration).sum())
-        place = 'departPos="base" departLane="best" departSpeed="avg"'
-    else:
+        places += ['departPos="base" departLane="best" departSpeed="avg"'] * len(departs)
+    if around:
         weight = lanes * length
         count = max(8, round(float(weight.sum()) / 1000 * rng.uniform(6, 15)))
-        departs = rng.uniform(0, DEPART_WITHIN, count).tolist()
-        starts = rng.choice(len(length), count, p=weight / weight.sum()).tolist()
-        place = 'departPos="random_free" departLane="best" departSpeed="speedLimit"'
+        departs += rng.uniform(0, DEPART_WITHIN, count).tolist()
+        starts += rng.choice(len(length), count, p=weight / weight.sum()).tolist()
+        places += ['departPos="random_free" departLane="best" departSpeed="speedLimit"'] * count
     order = np.argsort(departs, kind="stable")
     kinds = rng.choice(TYPES, len(order), p=shares)
     lines = ["<routes>", *types]
@@ -120,7 +121,7 @@ def write_demand(
             total += float(length[at])
         edges = " ".join(network.edge_names[e] for e in route)
         lines.append(
-            f'<vehicle id="{k}" type="t{kinds[k]}" depart="{departs[i]:.2f}" {place}>'
+            f'<vehicle id="{k}" type="t{kinds[k]}" depart="{departs[i]:.2f}" {places[i]}>'
             f'<route edges="{edges}"/></vehicle>'
         )
     (folder / ROUTES).write_text("\n".join([*lines, "</routes>"]))
