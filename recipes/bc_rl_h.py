@@ -38,7 +38,7 @@ def bc_rl_h(config: TrainConfig, processes: Processes) -> Trainer:
         score=realism_score(env, None, score="flags"),
         rule=KeepAll(),
         prepare=lambda start: with_drawn_goals(env, goals, start, seed, config.search.goals),
-        **collector_settings(config.search, env, seed, data, config.segments),
+        **collector_settings(config.search, env, seed, data, config.segments, KeepAll()),
     )
     replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
 

@@ -148,7 +148,12 @@ def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
 
 
 def collector_settings(
-    config: SearchConfig, env: DrivingEnv, seed: int, data: SceneDataset, segments: int
+    config: SearchConfig,
+    env: DrivingEnv,
+    seed: int,
+    data: SceneDataset,
+    segments: int,
+    rule: PruningRule | None = None,
 ) -> dict[str, Any]:
     """Settings that a collector of driving needs beside environment, policy and scores: whole trees of so many run
     segments at a time, random numbers that depend on nothing but seed, segment, branch and step.
@@ -159,7 +164,7 @@ def collector_settings(
         "keep_tree": True,
         "prune_every": config.prune_every,
         "rule_noise": pruning_noise(seed),
-        **_settings(env, pruning_rule(config)),
+        **_settings(env, pruning_rule(config) if rule is None else rule),
         "frames_per_batch": min(segments, len(data)) * config.branches * data.decisions,
         "total_frames": -1,
     }
