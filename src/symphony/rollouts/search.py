@@ -156,7 +156,8 @@ def collector_settings(
     rule: PruningRule | None = None,
 ) -> dict[str, Any]:
     """Settings that a collector of driving needs beside environment, policy and scores: whole trees of so many run
-    segments at a time, random numbers that depend on nothing but seed, segment, branch and step.
+    segments at a time, random numbers that depend on nothing but seed, segment, branch and step. ``rule`` prunes, by
+    default the configured one.
     """
     return {
         "branches": config.branches,
