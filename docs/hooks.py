@@ -117,12 +117,7 @@ class Markdown(Extension):
 
     def on_object(self, *, obj: Object, **kwargs: Any) -> None:
         """See :func:`as_markdown`."""
-        if (
-            obj.docstring is None
-            and obj.is_attribute
-            and obj.lineno
-            and obj.path.startswith("symphony.config")
-        ):
+        if obj.docstring is None and obj.is_attribute and obj.lineno:
             said = comment(str(obj.filepath), obj.lineno)
             obj.docstring = Docstring(said, parent=obj) if said else None
         if obj.docstring is not None:

@@ -120,7 +120,7 @@ def test_gradients_are_finite_at_degenerate_places():
         assert torch.isfinite(value.grad).all()
 
 
-FINE = 2000
+FINE = 1000
 
 
 poses = st.tuples(coordinate, coordinate, st.floats(-4, 4))

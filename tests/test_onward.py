@@ -48,7 +48,7 @@ def after(state, steps, timing=()):
 def test_lights_of_a_known_period_go_on_with_it(seed, period, more):
     rng = np.random.default_rng(seed)
     once = rng.integers(4, 7, (12, period)).astype(np.uint8)
-    whole, logged = np.tile(once, (1, 12)), 2 * period + int(rng.integers(3))
+    whole, logged = np.tile(once, (1, 13)), 2 * period + int(rng.integers(3))
     assert np.array_equal(after(whole[:, :logged], logged + more), whole[:, : logged + more])
     # Where no change comes twice no period is made up.
     assert cycle(np.eye(period, dtype=np.uint8)) is None

@@ -276,8 +276,8 @@ def test_unknown_headers_are_refused(filled: Path) -> None:
     for text, message in (
         ('{"format": "symphony segment store", "version": 2}', "reads a symphony segment store of version 1"),
         ('{"format": "zarr", "version": 1}', "is 'zarr'"),
-        ("{", "cannot be read as JSON"),
-        ("[]", "not an object"),
+        ("{", "not valid JSON"),
+        ("[]", "not a JSON object"),
     ):
         (filled / "store.json").write_text(text)
         for use in (SegmentStore, lambda path: StoreWriter(path, append=True)):

@@ -123,11 +123,11 @@ def test_nothing_of_the_future_is_used(settings):
 def test_vehicles_are_driven_and_people_walk_on(settings, monkeypatch):
     # Trees are independent, however many are searched at a time.
     monkeypatch.setattr("symphony.wosac.simulate.AT_ONCE", 12 * 2 * 3)
-    segment, settings = mixed_segment(), replace(settings, horizon=3.0)
+    segment, settings = mixed_segment(), replace(settings, horizon=2.0)
     found = wosac_rollouts(small(), segment, settings)
     assert found.object_id.tolist() == [100, 102, 103, 104]
-    assert all(getattr(found, name).shape == (32, 4, 30) for name in STATES)
-    start, steady = segment.origin[0] + segment.position[0, 10, 0], constant_velocity(segment, 30).x[:, 0]
+    assert all(getattr(found, name).shape == (32, 4, 20) for name in STATES)
+    start, steady = segment.origin[0] + segment.position[0, 10, 0], constant_velocity(segment, 20).x[:, 0]
     assert (np.abs((found.x[:, 0] - start) / (steady - start) - 1) < 0.5).all()
     # Every rollout is one of its own.
     assert len(np.unique(found.x[:, :, -1], axis=0)) == 32
@@ -394,17 +394,17 @@ def test_evaluation(tmp_path):
         assert main(["wosac", "evaluate", AGENT, "--data", str(store), "--json", str(out), *more]) == 0
         return json.loads(out.read_text())
 
-    found = record("--search", "none", "--horizon", "2")
+    found = record("--search", "none", "--horizon", "1")
     assert (found["objects"], found["hertz"]) == (6, [5.0])
     assert list(found["agents"]) == ["playback", "constant_velocity", "idm", "random", AGENT]
-    assert found["how"] == {"search": "none", "seed": 0, "logged_goals": False, "horizon": 2.0}
+    assert found["how"] == {"search": "none", "seed": 0, "logged_goals": False, "horizon": 1.0}
     for numbers in found["agents"].values():
         each = [one["metametric"] for one in numbers["segments"].values()]
         assert numbers["metametric"] == pytest.approx(np.mean(each))
         assert numbers["metametric_se"] >= 0
-    window = wosac_window(logs[1], 20)
+    window = wosac_window(logs[1], 10)
     steady = found["agents"]["constant_velocity"]["segments"][logs[1].segment_id]
-    assert steady == pytest.approx(score(wosac_scenario(window), constant_velocity(window, future=20)))
+    assert steady == pytest.approx(score(wosac_scenario(window), constant_velocity(window, future=10)))
     # One recording has no error; a part of the store can be named; baselines search for nothing.
     tree = ("--search", "tree", "--branches", "2", "--horizon", "1", "--segments", "2", "--config", "2024")
     found = record(*tree)

@@ -62,8 +62,8 @@ class Plan:
     segments: int  # how many
     seed: int = 0  # another seed is another set of networks
     split: Split = "train"  # training, validation and test sets never share a network, whatever their seeds
-    # of networks, which take turns; one named twice comes twice as often. A file of roads of one's own is a
-    # kind, too; its roads are the same for every split and seed, the traffic is another.
+    #: of networks, which take turns; one named twice comes twice as often. A file of roads of one's own is a
+    #: kind, too; its roads are the same for every split and seed, the traffic is another.
     kinds: tuple[str, ...] = ("town",)
     duration: int = 10  # seconds of a segment, one of :data:`DURATIONS`
     interactive: int = 2  # moving vehicles a segment must have at its first step (N_I)

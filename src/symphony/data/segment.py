@@ -108,15 +108,10 @@ class SignalState(IntEnum):
 
 @dataclass(frozen=True)
 class Polylines:
-    """Ragged polylines: line k is ``points[offsets[k]:offsets[k + 1]]``.
+    """Ragged polylines: line k is ``points[offsets[k]:offsets[k + 1]]``."""
 
-    Attributes:
-        points: [P, 3] x, y, z in metres (z = 0 where the source has none), float32.
-        offsets: [K + 1] int64, rising from 0 to P.
-    """
-
-    points: Floats
-    offsets: Ints
+    points: Floats  # [P, 3] x, y, z in metres (z = 0 where the source has none), float32
+    offsets: Ints  # [K + 1] int64, rising from 0 to P
 
     @classmethod
     def of(cls, lines: Sequence[NDArray[Any]]) -> Polylines:
@@ -143,95 +138,70 @@ class Polylines:
 
 @dataclass(frozen=True)
 class RoadMap:
-    """Lane graph, road boundary and markings.
+    """Lane graph, road boundary and markings."""
 
-    Attributes:
-        lanes: centre lines in the direction of travel (single points where the source has no more).
-        lane_id: [L] int64, the source's own ids (unique).
-        lane_type: [L] uint8, :class:`LaneType`.
-        speed_limit: [L] float32 m/s, NaN where unknown.
-        lane_width: [L] float32 metres, NaN where unknown.
-        successors: [E, 2] int32 lane indices (from, to): traffic flows from the end of one into the other.
-            Predecessors are the same pairs read backwards.
-        left_neighbors: [E', 2] int32 (lane, the lane on its left that a lane change may reach, same direction).
-        right_neighbors: [E'', 2] int32 (lane, the one on its right).
-        boundary: edge of the drivable area, *oriented: the drivable side is on the left*. Closed rings repeat
-            their first point.
-        marks: other features (lines, crosswalks, stop signs; a sign is a line of one point).
-        mark_type: [K] uint8, :class:`MarkType`.
-    """
-
-    lanes: Polylines
-    lane_id: Ints
-    lane_type: Ints
-    speed_limit: Floats
-    lane_width: Floats
+    lanes: Polylines  # centre lines in the direction of travel (single points where the source has no more)
+    lane_id: Ints  # [L] int64, the source's own ids (unique)
+    lane_type: Ints  # [L] uint8, :class:`LaneType`
+    speed_limit: Floats  # [L] float32 m/s, NaN where unknown
+    lane_width: Floats  # [L] float32 metres, NaN where unknown
+    #: [E, 2] int32 lane indices (from, to): traffic flows from the end of one into the other. Predecessors
+    #: are the same pairs read backwards.
     successors: Ints
+    #: [E', 2] int32 (lane, the lane on its left that a lane change may reach, same direction)
     left_neighbors: Ints
-    right_neighbors: Ints
+    right_neighbors: Ints  # [E'', 2] int32 (lane, the one on its right)
+    #: edge of the drivable area, *oriented: the drivable side is on the left*. Closed rings repeat their
+    #: first point.
     boundary: Polylines
-    marks: Polylines
-    mark_type: Ints
+    marks: Polylines  # other features (lines, crosswalks, stop signs; a sign is a line of one point)
+    mark_type: Ints  # [K] uint8, :class:`MarkType`
+
+    @property
+    def widths(self) -> NDArray[np.float64]:
+        """[L] metres, nominal ones where the source does not give them."""
+        nominal = np.where(self.lane_type == LaneType.BIKE_LANE, 1.6, 3.6)
+        return np.where(np.isnan(self.lane_width), nominal, self.lane_width)
 
 
 @dataclass(frozen=True)
 class RunSegment:
-    """A stretch of logged driving: agents, map and lights, at a fixed time step.
+    """A stretch of logged driving: agents, map and lights, at a fixed time step."""
 
-    Attributes:
-        segment_id: unique name, stable between conversions.
-        source: format it came from, such as ``womd``.
-        dt: seconds between steps.
-        ego: index of the ego agent (the recording vehicle, or the one picked by the reader).
-        agent_id: [A] int64, the source's ids (unique).
-        agent_type: [A] uint8, :class:`AgentType`.
-        size: [A, 3] float32 length, width, height of the box (height 0 where unknown).
-        position: [A, T, 3] float32 box centre x, y, z; 0 where not valid.
-        heading: [A, T] float32, as logged (not wrapped); 0 where not valid.
-        velocity: [A, T, 2] float32, world frame; 0 where not valid.
-        valid: [A, T] bool.
-        road: the map, in the same frame.
-        signal_lane: [Q] int32 index of the lane each light controls.
-        signal_point: [Q, 3] float32 its stop point.
-        signal_state: [Q, T] uint8, :class:`SignalState` (``UNKNOWN`` where unobserved).
-        origin: [3] float64, what was subtracted from the logged coordinates.
-        current_step: step up to which the log counts as history (0 where the source has no such notion).
-        interest: [I] int32 agents the source marks as interacting.
-        predict: [J] int32 agents the source marks for prediction.
-        file: name of the file it was read from, without folder.
-        group: the recording it is part of. Segments of one recording share it, may overlap in time and are no
-            independent samples; empty if unknown, which stands for ``segment_id``. No part of the content hash.
-        joined_gaps: links between lanes that conversion has added (see :mod:`symphony.data.joins`); a store keeps it
-            as a tag. No part of the content hash.
-        odd: what is unusual, or was left out (see :mod:`symphony.data.odd`): kind -> example. A store keeps it as a
-            tag. No part of the content hash.
-        logged: steps of the log where the segment goes on past it (:mod:`symphony.rollouts.onward`); 0 where all are.
-            No part of the content hash, and never in a store.
-    """
-
-    segment_id: str
-    source: str
-    dt: float
-    ego: int
-    agent_id: Ints
-    agent_type: Ints
-    size: Floats
-    position: Floats
-    heading: Floats
-    velocity: Floats
-    valid: Bools
-    road: RoadMap
-    signal_lane: Ints
-    signal_point: Floats
-    signal_state: Ints
-    origin: NDArray[np.float64]
+    segment_id: str  # unique name, stable between conversions
+    source: str  # format it came from, such as ``womd``
+    dt: float  # seconds between steps
+    ego: int  # index of the ego agent (the recording vehicle, or the one picked by the reader)
+    agent_id: Ints  # [A] int64, the source's ids (unique)
+    agent_type: Ints  # [A] uint8, :class:`AgentType`
+    size: Floats  # [A, 3] float32 length, width, height of the box (height 0 where unknown)
+    position: Floats  # [A, T, 3] float32 box centre x, y, z; 0 where not valid
+    heading: Floats  # [A, T] float32, as logged (not wrapped); 0 where not valid
+    velocity: Floats  # [A, T, 2] float32, world frame; 0 where not valid
+    valid: Bools  # [A, T] bool
+    road: RoadMap  # the map, in the same frame
+    signal_lane: Ints  # [Q] int32 index of the lane each light controls
+    signal_point: Floats  # [Q, 3] float32 its stop point
+    signal_state: Ints  # [Q, T] uint8, :class:`SignalState` (``UNKNOWN`` where unobserved)
+    origin: NDArray[np.float64]  # [3] float64, what was subtracted from the logged coordinates
+    #: step up to which the log counts as history (0 where the source has no such notion)
     current_step: int = 0
+    #: [I] int32 agents the source marks as interacting
     interest: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
+    #: [J] int32 agents the source marks for prediction
     predict: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
-    file: str = ""
+    file: str = ""  # name of the file it was read from, without folder
+    #: the recording it is part of. Segments of one recording share it, may overlap in time and are no
+    #: independent samples; empty if unknown, which stands for ``segment_id``. No part of the content hash.
     group: str = field(default="", metadata={"hashed": False})
+    #: links between lanes that conversion has added (see :mod:`symphony.data.joins`); a store keeps it as a
+    #: tag. No part of the content hash.
     joined_gaps: int = field(default=0, metadata={"hashed": False})
+    #: what is unusual, or was left out (see :mod:`symphony.data.odd`): kind -> example. A store keeps it as a
+    #: tag. No part of the content hash.
     odd: Mapping[str, str] = field(default_factory=dict, metadata={"hashed": False})
+    #: steps of the log where the segment goes on past it (:mod:`symphony.rollouts.onward`); 0 where all are.
+    #: No part of the content hash, and never in a store.
     logged: int = field(default=0, metadata={"hashed": False})
 
     @property

@@ -157,9 +157,9 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"cannot be read as JSON: {error}", file=path) from error
+        raise DataError(f"not valid JSON ({error})", file=path) from error
     if not isinstance(found, dict):
-        raise DataError("cannot be read as JSON: not an object", file=path)
+        raise DataError("not a JSON object", file=path)
     return found
 
 

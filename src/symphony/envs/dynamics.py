@@ -104,25 +104,17 @@ class Bicycle:
     quadratically, dense near coasting straight ahead: on real logs the greedy fit then swings least between
     neighbouring actions, for the same error.
 
-    Attributes:
-        max_acceleration: m/s^2, the grid is symmetric.
-        num_acceleration: size of the acceleration grid (odd, so that 0 is in it, and at least 3).
-        max_steering: radians.
-        num_steering: size of the steering grid (odd and at least 3, too).
-        heading_weight: metres that one radian of heading error counts for in the greedy fit.
-        speed_weight: metres that one m/s of speed error counts for in the greedy fit.
-        effort: metres that an acceleration of 1 m/s^2 counts for in the greedy fit, and a tenth of a radian of
-            steering; small, it decides where actions hardly differ, as at standstill, for the gentlest.
-
     Raises a :class:`ConfigError` for a grid of another size.
     """
 
-    max_acceleration: float = 4.0
-    num_acceleration: int = 7
-    max_steering: float = 0.5
-    num_steering: int = 21
-    heading_weight: float = 1.0
-    speed_weight: float = 0.3
+    max_acceleration: float = 4.0  # m/s^2, the grid is symmetric
+    num_acceleration: int = 7  # size of the acceleration grid (odd, so that 0 is in it, and at least 3)
+    max_steering: float = 0.5  # radians
+    num_steering: int = 21  # size of the steering grid (odd and at least 3, too)
+    heading_weight: float = 1.0  # metres that one radian of heading error counts for in the greedy fit
+    speed_weight: float = 0.3  # metres that one m/s of speed error counts for in the greedy fit
+    #: metres that an acceleration of 1 m/s^2 counts for in the greedy fit, and a tenth of a radian of
+    #: steering; small, it decides where actions hardly differ, as at standstill, for the gentlest
     effort: float = 0.002
     discrete: Literal[True] = True
     numbers: Literal[0] = 0

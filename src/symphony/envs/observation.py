@@ -34,37 +34,24 @@ class ObservationConfig:
     """How much an agent observes and how it is scaled to numbers near one.
 
     What is not asked for is neither computed nor an entry of a step: simulation without observation costs a fraction.
-
-    Attributes:
-        num_objects: nearest agents kept; 0 for no entries of objects.
-        num_points: nearest map and light points kept; 0 for no entries of points.
-        distance_scale: metres that become 1.
-        speed_scale: m/s that become 1.
-        size_scale: metres of a box side that become 1.
-        num_lights: nearest lights seen beside the points, as a group of their own; 0 for none.
-        route: whether it observes the route that is its goal.
-        turns: whether whoever chooses a route observes where routes turn and change lanes.
-        along: whether it observes where the objects are along that route.
-        gaps: whether it observes how far its box is from others.
-        clearance: whether it observes how far its box is from others and from the edge of the road.
-        foresight: seconds ahead at which it also observes how far it would be from others, were everyone to keep
-            speed and course; with ``gaps`` or ``clearance`` only.
-        own: whether it observes its own speed and size.
     """
 
-    num_objects: int = 16
-    num_points: int = 1000
-    num_lights: int = 0
-    distance_scale: float = 20.0
-    speed_scale: float = 10.0
-    size_scale: float = 5.0
-    route: bool = False
-    turns: bool = False
-    along: bool = False
-    gaps: bool = False
+    num_objects: int = 16  # nearest agents kept; 0 for no entries of objects
+    num_points: int = 1000  # nearest map and light points kept; 0 for no entries of points
+    num_lights: int = 0  # nearest lights seen beside the points, as a group of their own; 0 for none
+    distance_scale: float = 20.0  # metres that become 1
+    speed_scale: float = 10.0  # m/s that become 1
+    size_scale: float = 5.0  # metres of a box side that become 1
+    route: bool = False  # whether it observes the route that is its goal
+    turns: bool = False  # whether whoever chooses a route observes where routes turn and change lanes
+    along: bool = False  # whether it observes where the objects are along that route
+    gaps: bool = False  # whether it observes how far its box is from others
+    #: whether it observes how far its box is from others and from the edge of the road
     clearance: bool = False
+    #: seconds ahead at which it also observes how far it would be from others, were everyone to keep speed
+    #: and course; with ``gaps`` or ``clearance`` only
     foresight: tuple[float, ...] = ()
-    own: bool = True
+    own: bool = True  # whether it observes its own speed and size
 
     @property
     def blind(self) -> bool:

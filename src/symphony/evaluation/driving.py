@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import from_numpy
 
 from symphony.data.levels import levels_of
-from symphony.data.segment import LaneType, RunSegment, SignalState
+from symphony.data.segment import RunSegment, SignalState
 from symphony.geometry import levels_apart
 from symphony.geometry.polylines import stations_along
 from symphony.metrics.kinds import STANDING
@@ -30,7 +30,6 @@ Bools = NDArray[np.bool_]
 Heights = NDArray[np.float32] | None
 """Height and level [..., 2] of places; None where the map has no levels, so that all are on one."""
 
-LANE_WIDTH, BIKE_WIDTH = 3.6, 1.6  # metres, of lanes whose width is not known
 RED = (SignalState.STOP, SignalState.ARROW_STOP)
 GREEN = (SignalState.GO, SignalState.ARROW_GO)
 SAME_WAY = math.pi / 2  # largest angle between an agent and its lane
@@ -53,10 +52,8 @@ class Lanes:
     """
 
     def __init__(self, segment: RunSegment) -> None:
-        road = segment.road
-        self.segment, self.graph, self._levels = segment, LaneGraph(road), levels_of(segment)
-        nominal = np.where(road.lane_type == LaneType.BIKE_LANE, BIKE_WIDTH, LANE_WIDTH)
-        self.width = np.where(np.isnan(road.lane_width), nominal, road.lane_width).astype(np.float64)
+        self.segment, self.graph, self._levels = segment, LaneGraph(segment.road), levels_of(segment)
+        self.width = segment.road.widths
 
     def near(self, position: Reals, reach: float, height: Heights) -> Near:
         """Return pairs of a position [n, 2] and a lane on its level at most ``reach`` metres away."""

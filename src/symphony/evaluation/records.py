@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from symphony.agents.checkpoint import checkpoints
 from symphony.agents.choice import PREFIX, choose, split_name
 from symphony.config import EvaluateConfig
+from symphony.data.store_format import read_json
 from symphony.errors import ConfigError, DataError
 from symphony.files import write_json
 
@@ -152,7 +152,7 @@ def kept_evaluations(run: Path) -> dict[str, dict[str, Any]]:
 
 def read_evaluation(file: Path) -> dict[str, Any]:
     """Read a kept evaluation (see :func:`evaluation_record`); a DataError says what it lacks."""
-    record = _read_object(file)
+    record = read_json(file)
     if (found := record.get("format")) != FORMAT:
         raise DataError(f"format {found!r}, this version reads {FORMAT}", file=file, field="format")
     for part, names in _PARTS.items():
@@ -182,7 +182,7 @@ def choose_evaluation(run: Path, kept: Mapping[str, Any], patterns: Sequence[str
 
 def read_run(folder: Path) -> dict[str, Any]:
     """Read the configuration of a run as it is written; a DataError says that it can't be, or names no method."""
-    config = _read_object(folder / "config.json")
+    config = read_json(folder / "config.json")
     if not isinstance(config.get("method"), str):
         raise DataError("is missing", file=folder / "config.json", field="method")
     return config
@@ -209,13 +209,3 @@ def _runs_below(folder: Path) -> list[Path]:
         return [folder]
     inner = sorted(each for each in folder.iterdir() if each.is_dir()) if folder.is_dir() else []
     return [run for each in inner for run in _runs_below(each)]
-
-
-def _read_object(file: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(file.read_text(encoding="utf-8", errors="replace"))
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"not valid JSON ({error})", file=file) from error
-    if not isinstance(value, dict):
-        raise DataError("not a JSON object", file=file)
-    return value

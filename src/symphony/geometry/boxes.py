@@ -16,6 +16,10 @@ from torch import Tensor
 
 from symphony.geometry.frames import constant, wrap
 
+Pairs = Float[Tensor, "*#batch 2"]
+Angles = Float[Tensor, "*#batch"]
+Reals = Float[Tensor, "*batch"]
+
 _TURNED = 0.005
 """Metres that a corner may move by turning in one part of a step; in each part headings stay as they are."""
 _MOST_PARTS = 64
@@ -23,13 +27,8 @@ _SLOW = 1e-9
 
 
 def meeting_time(
-    way: Float[Tensor, "*#batch 2"],
-    speed: Float[Tensor, "*#batch 2"],
-    heading_a: Float[Tensor, "*#batch"],
-    size_a: Float[Tensor, "*#batch 2"],
-    heading_b: Float[Tensor, "*#batch"],
-    size_b: Float[Tensor, "*#batch 2"],
-) -> Float[Tensor, "*batch"]:
+    way: Pairs, speed: Pairs, heading_a: Angles, size_a: Pairs, heading_b: Angles, size_b: Pairs
+) -> Reals:
     """When boxes that keep velocity and heading first overlap: 0 for now, infinity for never.
 
     On each of the four face normals their shadows overlap from one time to another; the boxes do where all four do
@@ -58,12 +57,12 @@ def meeting_time(
 
 def contact_share(
     center_a: Float[Tensor, "*#batch 2 2"],
-    heading_a: Float[Tensor, "*#batch 2"],
-    size_a: Float[Tensor, "*#batch 2"],
+    heading_a: Pairs,
+    size_a: Pairs,
     center_b: Float[Tensor, "*#batch 2 2"],
-    heading_b: Float[Tensor, "*#batch 2"],
-    size_b: Float[Tensor, "*#batch 2"],
-) -> Float[Tensor, "*batch"]:
+    heading_b: Pairs,
+    size_b: Pairs,
+) -> Reals:
     """Share of a step, from 0 to 1, after which two boxes first overlap; infinity where they don't.
 
     Centres move straight and headings turn evenly from the first of two poses to the second. Boxes that overlap at
@@ -109,8 +108,8 @@ def contact_share(
 
 
 def pose_at(
-    center: Float[Tensor, "*batch 2 2"], heading: Float[Tensor, "*batch 2"], share: Float[Tensor, "*batch"]
-) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
+    center: Float[Tensor, "*batch 2 2"], heading: Float[Tensor, "*batch 2"], share: Reals
+) -> tuple[Float[Tensor, "*batch 2"], Reals]:
     """Centre and heading after a share of a step, as :func:`contact_share` moves boxes."""
     turn = 0.5 * wrap(2.0 * (heading[..., 1] - heading[..., 0]))
     place = center[..., 0, :] + share[..., None] * (center[..., 1, :] - center[..., 0, :])
@@ -120,9 +119,7 @@ def pose_at(
 _CORNER_SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 
 
-def box_corners(
-    center: Float[Tensor, "*#batch 2"], heading: Float[Tensor, "*#batch"], size: Float[Tensor, "*#batch 2"]
-) -> Float[Tensor, "*batch 4 2"]:
+def box_corners(center: Pairs, heading: Angles, size: Pairs) -> Float[Tensor, "*batch 4 2"]:
     """Corners counter-clockwise: front left, rear left, rear right, front right."""
     local = 0.5 * size[..., None, :] * constant(_CORNER_SIGNS, size.dtype, size.device)
     cos, sin = torch.cos(heading)[..., None], torch.sin(heading)[..., None]
@@ -131,12 +128,7 @@ def box_corners(
 
 
 def boxes_overlap(
-    center_a: Float[Tensor, "*#batch 2"],
-    heading_a: Float[Tensor, "*#batch"],
-    size_a: Float[Tensor, "*#batch 2"],
-    center_b: Float[Tensor, "*#batch 2"],
-    heading_b: Float[Tensor, "*#batch"],
-    size_b: Float[Tensor, "*#batch 2"],
+    center_a: Pairs, heading_a: Angles, size_a: Pairs, center_b: Pairs, heading_b: Angles, size_b: Pairs
 ) -> Bool[Tensor, "*batch"]:
     """Whether the two boxes overlap, by the separating-axis test.
 
@@ -149,13 +141,8 @@ def boxes_overlap(
 
 
 def box_gap(
-    center_a: Float[Tensor, "*#batch 2"],
-    heading_a: Float[Tensor, "*#batch"],
-    size_a: Float[Tensor, "*#batch 2"],
-    center_b: Float[Tensor, "*#batch 2"],
-    heading_b: Float[Tensor, "*#batch"],
-    size_b: Float[Tensor, "*#batch 2"],
-) -> Float[Tensor, "*batch"]:
+    center_a: Pairs, heading_a: Angles, size_a: Pairs, center_b: Pairs, heading_b: Angles, size_b: Pairs
+) -> Reals:
     """Signed distance between two boxes, in metres.
 
     Apart: the Euclidean gap. Overlapping: minus the penetration depth, the length of the shortest translation
@@ -165,13 +152,8 @@ def box_gap(
 
 
 def gap_between(
-    x: Float[Tensor, "*#batch"],
-    y: Float[Tensor, "*#batch"],
-    heading_a: Float[Tensor, "*#batch"],
-    size_a: Float[Tensor, "*#batch 2"],
-    heading_b: Float[Tensor, "*#batch"],
-    size_b: Float[Tensor, "*#batch 2"],
-) -> Float[Tensor, "*batch"]:
+    x: Angles, y: Angles, heading_a: Angles, size_a: Pairs, heading_b: Angles, size_b: Pairs
+) -> Reals:
     """:func:`box_gap` of boxes whose centres are ``x`` and ``y`` metres apart, seen from a."""
     pair = relation(x, y, heading_a, heading_b)
     separation, back = _separations(pair, size_a, size_b), (-pair.in_b[0], -pair.in_b[1])
@@ -183,7 +165,7 @@ def gap_between(
     return torch.where(separation <= 0, separation, apart)
 
 
-_Plane = tuple[Float[Tensor, "*#b"], Float[Tensor, "*#b"]]
+_Plane = tuple[Angles, Angles]
 """Two components that belong together, each a tensor of its own: operations on a last dimension of 2 are slow."""
 
 
@@ -201,28 +183,23 @@ class _Pair(NamedTuple):
     turn: _Plane
 
 
-def _way(center_a: Float[Tensor, "*#b 2"], center_b: Float[Tensor, "*#b 2"]) -> _Plane:
+def _way(center_a: Pairs, center_b: Pairs) -> _Plane:
     return center_b[..., 0] - center_a[..., 0], center_b[..., 1] - center_a[..., 1]
 
 
-def relation(
-    x: Float[Tensor, "*#b"],
-    y: Float[Tensor, "*#b"],
-    heading_a: Float[Tensor, "*#b"],
-    heading_b: Float[Tensor, "*#b"],
-) -> _Pair:
+def relation(x: Angles, y: Angles, heading_a: Angles, heading_b: Angles) -> _Pair:
     """Where a box is whose centre is ``x`` and ``y`` metres from that of box a."""
     turn = heading_b - heading_a
     return _Pair(turned(x, y, heading_a), turned(x, y, heading_b), (torch.cos(turn), torch.sin(turn)))
 
 
-def turned(x: Float[Tensor, "*#b"], y: Float[Tensor, "*#b"], heading: Float[Tensor, "*#b"]) -> _Plane:
+def turned(x: Angles, y: Angles, heading: Angles) -> _Plane:
     """A vector along and across a heading."""
     cos, sin = torch.cos(heading), torch.sin(heading)
     return cos * x + sin * y, cos * y - sin * x
 
 
-def _separations(pair: _Pair, size_a: Float[Tensor, "*#b 2"], size_b: Float[Tensor, "*#b 2"]) -> Tensor:
+def _separations(pair: _Pair, size_a: Pairs, size_b: Pairs) -> Tensor:
     """Largest separation along the four face normals: negative where the boxes overlap."""
     # Each box's axes are treated alike, so that swapping the boxes gives the same bits.
     cover = covers(pair.turn, size_a, size_b)
@@ -231,9 +208,7 @@ def _separations(pair: _Pair, size_a: Float[Tensor, "*#b 2"], size_b: Float[Tens
     return torch.maximum(torch.maximum(gaps[0], gaps[2]), torch.maximum(gaps[1], gaps[3]))
 
 
-def covers(
-    turn: _Plane, size_a: Float[Tensor, "*#b 2"], size_b: Float[Tensor, "*#b 2"]
-) -> tuple[Tensor, ...]:
+def covers(turn: _Plane, size_a: Pairs, size_b: Pairs) -> tuple[Tensor, ...]:
     """How far apart centres may be for the boxes to overlap, along and across a, and along and across b."""
     cos, sin = (part.abs() for part in turn)
     length_a, width_a = 0.5 * size_a[..., 0], 0.5 * size_a[..., 1]
@@ -246,9 +221,7 @@ def covers(
     )
 
 
-def _corner_distance(
-    way: _Plane, turn: _Plane, size: Float[Tensor, "*#b 2"], other_size: Float[Tensor, "*#b 2"]
-) -> Tensor:
+def _corner_distance(way: _Plane, turn: _Plane, size: Pairs, other_size: Pairs) -> Tensor:
     """Smallest distance of the other box's corners from this box (0 inside).
 
     Takes the way to the other's centre, along and across this one, and cosine and sine of the other's heading

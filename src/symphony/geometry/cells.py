@@ -40,13 +40,8 @@ _FILLING = Lock()
 class Cells(ABC):
     """The cells of B maps, and lists for those that somebody has been in.
 
-    Args:
-        low: [B, 2] metres of the lower left corner of what is on each map.
-        high: [B, 2] metres of the upper right one.
-        some: [B] whether a map has cells at all.
-        size: least side of a cell, metres.
-        total: elements per map, padding included.
-        wanted: how many are looked for.
+    Takes the corners [B, 2] of what is on each map in metres, whether it has cells at all [B], the least side of a
+    cell, the elements per map, padding included, and how many are looked for.
     """
 
     def __init__(

@@ -44,10 +44,10 @@ def route_turns(
 class Choice:
     """What a search made of the goals of one segment."""
 
-    # [3] agents of all branches by the turn of the route they drew, see :data:`TURNS`
+    #: [3] agents of all branches by the turn of the route they drew, see :data:`TURNS`
     drawn: NDArray[np.int64]
     kept: NDArray[np.int64]  # [3] agents of the rollouts by the turn of the route they follow
-    # total variation between drawn and kept routes (0 to 1), mean over agents; NaN without a route
+    #: total variation between drawn and kept routes (0 to 1), mean over agents; NaN without a route
     variation: float
     founders: float  # first branches that some rollout descends from, mean over trees
 

@@ -29,26 +29,16 @@ class CollisionKind(IntEnum):
 
     The headings before contact decide the way. Of two agents that go the same way the sides that met are those whose
     gap closed last, at the time of contact: ends (one ahead of the other) or flanks (one beside the other).
-
-    Attributes:
-        INTO_LEADER: same way, its front met the tail of one ahead.
-        ONCOMING: the other faces the opposite way.
-        CROSSING: the other faces across.
-        SIDESWIPE: same way, flank to flank, as after a lane change.
-        OTHER: same way, end to end, because one backed into the other, which stood or backed too.
-        REAR_ENDED: same way, its tail was met by the front of one behind.
-        PEDESTRIAN: the other is a pedestrian, wherever they came from.
-        CYCLIST: the other is a cyclist, wherever they came from.
     """
 
-    INTO_LEADER = 0
-    ONCOMING = 1
-    CROSSING = 2
-    SIDESWIPE = 3
-    OTHER = 4
-    REAR_ENDED = 5
-    PEDESTRIAN = 6
-    CYCLIST = 7
+    INTO_LEADER = 0  # same way, its front met the tail of one ahead
+    ONCOMING = 1  # the other faces the opposite way
+    CROSSING = 2  # the other faces across
+    SIDESWIPE = 3  # same way, flank to flank, as after a lane change
+    OTHER = 4  # same way, end to end, because one backed into the other, which stood or backed too
+    REAR_ENDED = 5  # same way, its tail was met by the front of one behind
+    PEDESTRIAN = 6  # the other is a pedestrian, wherever they came from
+    CYCLIST = 7  # the other is a cyclist, wherever they came from
 
 
 _RANK = (0, 1, 2, 3, 4, 7, 5, 6)

@@ -67,7 +67,7 @@ class OrderStatistics:
     kept: float  # share of their rollouts in which the same one goes first
     reversed: float  # share in which the other one does
     apart: float  # share in which the paths don't meet, or both are there at once
-    # mean absolute difference of the seconds between the two from the log's, where they meet
+    #: mean absolute difference of the seconds between the two from the log's, where they meet
     gap_error: float
 
 

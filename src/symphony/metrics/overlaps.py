@@ -25,7 +25,7 @@ class Meetings(NamedTuple):
     subject: Int[Tensor, " E"]  # of N subjects
     other: Int[Tensor, " E"]  # of A agents
     step: Int[Tensor, " E"]  # from state ``step`` to the next one; with ``at_states`` the state
-    # of the step after which they first overlap, see :func:`symphony.geometry.contact_share`
+    #: of the step after which they first overlap, see :func:`symphony.geometry.contact_share`
     share: Float[Tensor, " E"]
 
 

@@ -36,7 +36,11 @@ def jensen_shannon(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.floa
 
     It is the divergence itself, not its square root.
     """
-    p, q = (_normalised(np.asarray(counts, dtype=np.float64)) for counts in (first, second))
+    counts = [np.asarray(each, dtype=np.float64) for each in (first, second)]
+    totals = [each.sum(-1, keepdims=True) for each in counts]
+    p, q = (
+        np.divide(c, t, out=np.full_like(c, np.nan), where=t > 0) for c, t in zip(counts, totals, strict=True)
+    )
     middle = (p + q) / 2
     divergence = (_relative(p, middle) + _relative(q, middle)) / 2
     return np.maximum(divergence, 0.0)
@@ -85,11 +89,6 @@ def sampling_floor(counts_log: NDArray[Any]) -> float:
     return float(known.mean()) if len(known) else math.nan
 
 
-def _normalised(counts: NDArray[np.float64]) -> NDArray[np.float64]:
-    total = counts.sum(-1, keepdims=True)
-    return np.where(total > 0, counts / np.where(total > 0, total, 1.0), np.nan)
-
-
 def _relative(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sum of p ln(p / q) over the bins where p is not 0; NaN stays NaN."""
     none = p == 0
@@ -124,7 +123,7 @@ class SegmentResult:
 
     group: str  # the recording it is part of
     rollouts: int  # K
-    # of every number that is a ratio of sums over segments, what the segment adds to the two sums
+    #: of every number that is a ratio of sums over segments, what the segment adds to the two sums
     sums: dict[str, tuple[float, float]]
     ade: float  # its own ADE, metres; NaN where the log is valid at no step
     histogram: NDArray[np.int64]  # [201] curvatures of the branching regions visited by the rollouts
@@ -162,28 +161,16 @@ class RolloutMetrics:
         curvature_log: Sequence[NDArray[Any]],
         choices: Sequence[Choice] | None = None,
     ) -> None:
-        """Add the rollouts of some segments.
+        """Add the rollouts of some segments, each seen once in all updates, else a ValueError is raised.
 
-        Args:
-            segment_ids: [B], each seen once in all updates.
-            groups: [B] the recording each segment is part of (see ``RunSegment.group``). Segments of one recording
-                are no independent samples: standard errors are over groups.
-            simulated: agent-steps that exist; the rest counts for nothing.
-            logged: where the log is valid; the rest does not count for distances from the log.
-            at_states: whether an agent's box overlaps another at the state after a step.
-            offroad: whether an agent's centre is off the road.
-            bounded: whether the map of a segment has a boundary: where it has none nobody is off or on the road.
-            displacement: metres from the log.
-            speed: m/s in the rollouts.
-            speed_log: m/s in the log.
-            last: number of the last step of each segment.
-            kinds: [B, K, N] first collisions of simulated agents.
-            kinds_logged: [B, K, N] first collisions of simulated agents while their log exists.
-            curvature: per segment, the average curvature of every branching region visited by each rollout.
-            curvature_log: per segment, the same of those visited by the log.
-            choices: [B] what the search made of the goals; None without search or goals.
-
-        Raises ValueError for a segment that was added before.
+        Segments of one recording (``groups``, see ``RunSegment.group``) are no independent samples: standard errors
+        are over groups. Only agent-steps that exist (``simulated``) count, and where the log is valid (``logged``)
+        distances from it, ``displacement`` in metres. Flags say whether an agent's box overlaps another at the state
+        after a step, and whether its centre is off the road, which nobody is where the map has no boundary
+        (``bounded``). Speeds are in m/s, ``last`` numbers the last step of each segment, ``kinds`` [B, K, N] are
+        first collisions, those logged while their log exists. ``curvature`` is the average curvature of every
+        branching region visited by each rollout of a segment, and by the log; ``choices`` what the search made of the
+        goals.
         """
         # Sums are exact, so that padding among what is summed does not change how they are rounded.
         away = displacement.double().masked_fill(~(simulated & logged[:, None]), 0.0).flatten(2).tolist()
@@ -229,7 +216,7 @@ class RolloutMetrics:
                 ade=_quotient(error.sum(), count.sum()),
                 histogram=curvature_histogram(curvature[b]),
                 histogram_log=curvature_histogram(curvature_log[b]),
-                speeds=np.stack([_speed_histogram(driven[both]) for driven in (own, log)], -1),
+                speeds=np.stack([_speeds(driven[both]) for driven in (own, log)], -1),
                 choice=None if choices is None else choices[b],
             )
 
@@ -355,5 +342,5 @@ def _quotient(total: float, weight: float) -> float:
     return float(total / weight) if weight else math.nan
 
 
-def _speed_histogram(speed: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
+def _speeds(speed: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
     return np.bincount((np.abs(speed) / WIDTH).astype(np.int64).clip(max=_SPEEDS - 1), minlength=_SPEEDS)

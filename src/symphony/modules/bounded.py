@@ -12,6 +12,9 @@ from torch.distributions import Distribution, Normal, constraints
 
 from symphony.geometry.frames import constant
 
+Pairs = Float[Tensor, "*b 2"]
+Reals = Float[Tensor, "*b"]
+
 SMOOTH = 0.02  # metres within which a displacement bends smoothly towards zero instead of turning negative
 INSIDE = 0.95
 """Share of the bounds beyond which an action counts as lying there, so that its likelihood stays finite."""
@@ -19,7 +22,7 @@ LEAST = 1e-3  # metres below which a histogram takes all displacements for stand
 EDGE = 1e-6  # how near to an end of its cell a draw may come, as a share of the cell
 
 
-def inverse_cdf(logits: Float[Tensor, "*b C"], noise: Float[Tensor, "*b"]) -> Int[Tensor, "*b"]:
+def inverse_cdf(logits: Float[Tensor, "*b C"], noise: Reals) -> Int[Tensor, "*b"]:
     """Draw categories `[...]` int64 from logits `[..., C]` by uniform numbers `[...]` in [0, 1].
 
     The category is the one whose interval of the cumulative distribution holds the number; a category of
@@ -37,19 +40,17 @@ def inverse_cdf(logits: Float[Tensor, "*b C"], noise: Float[Tensor, "*b"]) -> In
     return torch.minimum(drawn, last).squeeze(-1)
 
 
-def squash(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+def squash(x: Reals) -> Reals:
     """`x / sqrt(1 + x^2)`, in (-1, 1)."""
     return x / (1.0 + x.square()).sqrt()
 
 
-def positive(x: Float[Tensor, "*b"], smooth: float = SMOOTH) -> Float[Tensor, "*b"]:
+def positive(x: Reals, smooth: float = SMOOTH) -> Reals:
     """A smooth `max(x, 0)`: `(x + sqrt(x^2 + smooth^2)) / 2`, above it by at most `smooth / 2`."""
     return 0.5 * (x + (x.square() + smooth**2).sqrt())
 
 
-def displaced(
-    share: Float[Tensor, "*b 2"], pace: Float[Tensor, "*b"], slope: Float[Tensor, "*b"], reach: float
-) -> Float[Tensor, "*b 2"]:
+def displaced(share: Pairs, pace: Reals, slope: Reals, reach: float) -> Pairs:
     """Displacements [..., 2] (metres; forward, left) by shares [..., 2] in (-1, 1) of what can be reached.
 
     forward = positive(pace + reach share1), so the speed changes by at most reach / dt and never becomes negative;
@@ -59,13 +60,7 @@ def displaced(
     return torch.stack([forward, forward * slope * share[..., 1]], -1)
 
 
-def shares(
-    displacement: Float[Tensor, "*b 2"],
-    pace: Float[Tensor, "*b"],
-    slope: Float[Tensor, "*b"],
-    reach: float,
-    least: float = 1e-4,
-) -> Float[Tensor, "*b 2"]:
+def shares(displacement: Pairs, pace: Reals, slope: Reals, reach: float, least: float = 1e-4) -> Pairs:
     """Inverse of :func:`displaced`; what can't be reached has shares beyond 1. Less than `least` metres forward count
     as so many.
     """
@@ -74,9 +69,7 @@ def shares(
     return torch.stack([first, displacement[..., 1] / (forward * slope)], -1)
 
 
-def log_area(
-    share: Float[Tensor, "*b 2"], pace: Float[Tensor, "*b"], slope: Float[Tensor, "*b"], reach: float
-) -> Float[Tensor, "*b"]:
+def log_area(share: Pairs, pace: Reals, slope: Reals, reach: float) -> Reals:
     """Logarithm [...] of the square metres of displacements per area of shares."""
     x = pace + reach * share[..., 0]
     bend = 0.5 * (1.0 + x / (x.square() + SMOOTH**2).sqrt())
@@ -98,10 +91,10 @@ class BoundedDisplacement(Distribution):
 
     def __init__(
         self,
-        loc: Float[Tensor, "*b 2"],
-        scale: Float[Tensor, "*b 2"],
-        pace: Float[Tensor, "*b"],
-        slope: Float[Tensor, "*b"],
+        loc: Pairs,
+        scale: Pairs,
+        pace: Reals,
+        slope: Reals,
         reach: float,
         validate_args: bool | None = None,
     ) -> None:
@@ -122,11 +115,11 @@ class BoundedDisplacement(Distribution):
             validate_args=False,
         )
 
-    def displacement(self, u: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+    def displacement(self, u: Pairs) -> Pairs:
         """The displacement that Gaussian numbers [..., 2] stand for."""
         return displaced(squash(u), self.pace, self.slope, self.reach)
 
-    def latent(self, displacement: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+    def latent(self, displacement: Pairs) -> Pairs:
         """Inverse of :meth:`displacement`; what lies outside the bounds or next to them is moved to INSIDE them."""
         share = shares(displacement, self.pace, self.slope, self.reach)
         share = share.clamp(-INSIDE, INSIDE)
@@ -135,27 +128,27 @@ class BoundedDisplacement(Distribution):
     def rsample(
         self,
         sample_shape: torch.Size | Sequence[int] = torch.Size(),  # noqa: B008
-    ) -> Float[Tensor, "*b 2"]:
+    ) -> Pairs:
         """Draw, with gradient to the parameters."""
         shape = self._extended_shape(torch.Size(sample_shape))
         noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
         return self.displacement(self.loc + self.scale * noise)
 
-    def icdf(self, value: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+    def icdf(self, value: Pairs) -> Pairs:
         """The draw that independent uniform numbers [..., 2] in (0, 1) stand for, with gradient to the parameters."""
         return self.displacement(self.loc + self.scale * torch.special.ndtri(value))
 
     @property
-    def mode(self) -> Float[Tensor, "*b 2"]:
+    def mode(self) -> Pairs:
         """The displacement of the mean of u (the median of either component)."""
         return self.displacement(self.loc)
 
     @property
-    def deterministic_sample(self) -> Float[Tensor, "*b 2"]:
+    def deterministic_sample(self) -> Pairs:
         """What TorchRL takes when it does not explore."""
         return self.mode
 
-    def log_prob(self, value: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
+    def log_prob(self, value: Pairs) -> Reals:
         """Log-density [...]; that of the nearest displacement INSIDE the bounds where `value` is not: no entropy."""
         u = self.latent(value)
         # Both squashings have the derivative (1 + u^2)^(-3/2).
@@ -187,8 +180,8 @@ class DisplacementHistogram(Distribution):
     def __init__(
         self,
         logits: Float[Tensor, "*b C"],
-        pace: Float[Tensor, "*b"],
-        slope: Float[Tensor, "*b"],
+        pace: Reals,
+        slope: Reals,
         reach: float,
         forward: int,
         validate_args: bool | None = None,
@@ -220,13 +213,13 @@ class DisplacementHistogram(Distribution):
         return forward, left
 
     @property
-    def mean_share(self) -> Float[Tensor, "*b 2"]:
+    def mean_share(self) -> Pairs:
         """Mean [..., 2] of the shares drawn, with gradient to the logits."""
         probability = self.logits.softmax(-1).unflatten(-1, self.cells)
         middle = [(edges[1:] + edges[:-1]) / 2 for edges in self.edges]
         return torch.stack([(probability.sum(-1 - k) * middle[k]).sum(-1) for k in range(2)], -1)
 
-    def within(self, cell: Int[Tensor, "*b"], place: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+    def within(self, cell: Int[Tensor, "*b"], place: Pairs) -> Pairs:
         """Shares [..., 2] at places [..., 2] in (0, 1) of cells by number."""
         # Cells of one acceleration lie side by side.
         number = torch.stack([cell // self.cells[1], cell % self.cells[1]], -1)
@@ -236,7 +229,7 @@ class DisplacementHistogram(Distribution):
         )
         return low + (high - low) * place
 
-    def icdf(self, value: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+    def icdf(self, value: Pairs) -> Pairs:
         """The draw that independent uniform numbers [..., 2] in (0, 1) stand for.
 
         The first decides the cell and, by where it lies in that cell's share of (0, 1), the place along it; the
@@ -258,23 +251,23 @@ class DisplacementHistogram(Distribution):
     def rsample(
         self,
         sample_shape: torch.Size | Sequence[int] = torch.Size(),  # noqa: B008
-    ) -> Float[Tensor, "*b 2"]:
+    ) -> Pairs:
         """Draw, with gradient to the logits and the bounds."""
         shape = self._extended_shape(torch.Size(sample_shape))
         return self.icdf(torch.rand(shape, dtype=self.logits.dtype, device=self.logits.device))
 
     @property
-    def mode(self) -> Float[Tensor, "*b 2"]:
+    def mode(self) -> Pairs:
         """The middle of the likeliest cell."""
         share = self.within(self.logits.argmax(-1), self.logits.new_full((*self.batch_shape, 2), 0.5))
         return displaced(share, self.pace, self.slope, self.reach)
 
     @property
-    def deterministic_sample(self) -> Float[Tensor, "*b 2"]:
+    def deterministic_sample(self) -> Pairs:
         """What TorchRL takes when it does not explore."""
         return self.mode
 
-    def log_prob(self, value: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
+    def log_prob(self, value: Pairs) -> Reals:
         """Log-density [...]; that of the nearest displacement that can be reached where `value` is not one."""
         share = shares(value, self.pace, self.slope, self.reach, LEAST).clamp(-1.0, 1.0)
         area = log_area(share, self.pace, self.slope, self.reach)

@@ -29,8 +29,8 @@ class ElementGroup:
     mask_key: NestedKey  # bool `[..., N, K]`, True where an element is valid
     features: int  # features of one element, those under further keys included
     more_keys: tuple[NestedKey, ...] = ()  # further features `[..., N, K, F]` of the same elements
-    # signed gaps `[..., N, K]` or `[..., N, K, H]` to them in metres, of which :func:`gap_features` makes
-    # three features each
+    #: signed gaps `[..., N, K]` or `[..., N, K, H]` to them in metres, of which :func:`gap_features` makes
+    #: three features each
     gap_keys: tuple[NestedKey, ...] = ()
 
 
@@ -144,13 +144,8 @@ def scene_module(
 ) -> TensorDictModule:
     """Wrap a network over scenes so that it reads its inputs, in order, from a TensorDict.
 
-    Args:
-        network: called with own features, mask, the elements and mask of each group, and what ``more_keys`` hold.
-        groups: types of elements.
-        out_key: where its result goes.
-        own_keys: features of the agent itself, concatenated.
-        valid_key: mask of the agents.
-        more_keys: further inputs.
+    It is called with the own features (under all ``own_keys``, concatenated), the agents' mask, the elements and mask
+    of each group, and what ``more_keys`` hold.
     """
     read = [key for group in groups for key in (group.key, group.mask_key, *group.more_keys, *group.gap_keys)]
     apart = len(own_keys) > 1 or any(group.more_keys or group.gap_keys for group in groups)

@@ -19,23 +19,8 @@ from tensordict.nn.probabilistic import interaction_type
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution
 
+from symphony import keys
 from symphony.geometry.nearest import on_host
-from symphony.keys import (
-    ACTION,
-    GOAL,
-    GOAL_LOGITS,
-    GOAL_NOISE,
-    LOG_PROB,
-    LOGITS,
-    NOISE,
-    OWN,
-    ROUTES,
-    ROUTES_MASK,
-    STATE,
-    STEP,
-    STREAM,
-    VALID,
-)
 from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram, inverse_cdf, positive
 from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, SceneNetwork, mlp, scene_module
 from symphony.streams import fold_in, uniform
@@ -85,8 +70,8 @@ def goal_policy(
     route_features: int,
     *,
     hidden: int = 64,
-    own_keys: Sequence[NestedKey] = (OWN,),
-    valid_key: NestedKey = VALID,
+    own_keys: Sequence[NestedKey] = (keys.OWN,),
+    valid_key: NestedKey = keys.VALID,
     encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
     """A categorical over each agent's feasible routes, given the first state: h(g | s_1).
@@ -101,12 +86,12 @@ def goal_policy(
         scene_module(
             network,
             groups,
-            GOAL_LOGITS,
+            keys.GOAL_LOGITS,
             own_keys=own_keys,
             valid_key=valid_key,
-            more_keys=(ROUTES, ROUTES_MASK),
+            more_keys=(keys.ROUTES, keys.ROUTES_MASK),
         ),
-        NoiseSampler(GOAL_LOGITS, GOAL, noise_key=GOAL_NOISE),
+        NoiseSampler(keys.GOAL_LOGITS, keys.GOAL, noise_key=keys.GOAL_NOISE),
     )
 
 
@@ -160,11 +145,11 @@ def displacement_policy(
     cells: int = 0,
     dt: float,
     size_scale: float = 5.0,
-    own_keys: Sequence[NestedKey] = (OWN,),
-    valid_key: NestedKey = VALID,
-    state_key: NestedKey = STATE,
-    action_key: NestedKey = ACTION,
-    noise_key: NestedKey = NOISE,
+    own_keys: Sequence[NestedKey] = (keys.OWN,),
+    valid_key: NestedKey = keys.VALID,
+    state_key: NestedKey = keys.STATE,
+    action_key: NestedKey = keys.ACTION,
+    noise_key: NestedKey = keys.NOISE,
     encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
     """Encoder, head and a :class:`BoundedDisplacement` (the action space the paper gives to MGAIL, section V-A), or a
@@ -174,20 +159,10 @@ def displacement_policy(
     (reparameterised) according to TorchRL's exploration type; a pair of uniform numbers under `noise_key` decides
     them where there is one (see :class:`NoiseSampler`).
 
-    Args:
-        own_features: features under all `own_keys` together; the second of the first key is the box length.
-        groups: types of elements.
-        hidden: width of the encoders.
-        head: widths of the head's hidden layers.
-        cells: of the histogram, along and across; 0 for a Gaussian.
-        dt: seconds per step.
-        size_scale: metres of box length that the own feature counts as 1.
-        own_keys: features of the agent itself, concatenated.
-        valid_key: mask of the agents.
-        state_key: `[..., N, 4]`, of which the speed is read.
-        action_key: written.
-        noise_key: `[..., N, 2]`, optional in the TensorDict.
-        encoder: a class with the arguments of :class:`SceneEncoder`.
+    `own_features` counts those under all `own_keys`; the second of the first key is the box length, of which
+    `size_scale` metres count as 1. There are so many `cells` along and across, 0 for a Gaussian; `dt` are seconds per
+    step. Of `state_key` `[..., N, 4]` the speed is read. Another `encoder` takes the arguments of
+    :class:`SceneEncoder`.
     """
     if cells and (cells < 3 or cells % 2 == 0):
         raise ValueError(f"cells must be odd and at least 3, or 0 for none, is {cells}")
@@ -222,8 +197,8 @@ class SeededNoise(TensorDictModuleBase):
     There are ``numbers`` of them per agent; 0 stands for a single one without a dimension of its own.
     """
 
-    in_keys = [STREAM, STEP, VALID]  # noqa: RUF012 - the type TensorDictModuleBase declares
-    out_keys = [NOISE]  # noqa: RUF012
+    in_keys = [keys.STREAM, keys.STEP, keys.VALID]  # noqa: RUF012 - the type TensorDictModuleBase declares
+    out_keys = [keys.NOISE]  # noqa: RUF012
 
     def __init__(self, seed: int, numbers: int = 0) -> None:
         super().__init__()
@@ -231,13 +206,13 @@ class SeededNoise(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write numbers [..., N] or [..., N, numbers] in (0, 1)."""
-        agents = tensordict.get(VALID).shape[-1]
+        agents = tensordict.get(keys.VALID).shape[-1]
         place = torch.arange(agents, device=tensordict.device)
-        stream, step = fold_in(tensordict.get(STREAM), place), tensordict.get(STEP)
+        stream, step = fold_in(tensordict.get(keys.STREAM), place), tensordict.get(keys.STEP)
         if self.numbers:
             stream = fold_in(stream[..., None], torch.arange(self.numbers, device=stream.device))
             step = step[..., None]
-        return tensordict.set(NOISE, uniform(self.seed, stream, step))
+        return tensordict.set(keys.NOISE, uniform(self.seed, stream, step))
 
 
 class NoiseSampler(ProbabilisticTensorDictModule):
@@ -248,25 +223,21 @@ class NoiseSampler(ProbabilisticTensorDictModule):
     the same scene and numbers give the same action in any batch. Without them, or with another exploration type,
     it samples as its base class does.
 
-    Args:
-        parameters: key of the logits `[..., C]`, or the keys of all parameters by their names.
-        action_key: written.
-        noise_key: float in (0, 1), optional in the TensorDict.
-        distribution_class: a categorical, or one with an `icdf`.
-        distribution_kwargs: what else it takes.
-        return_log_prob: write the action's log-probability `[...]` under `log_prob_key`.
+    Takes the key of the logits `[..., C]`, or the keys of all parameters by their names; a categorical, or a class
+    with an `icdf`, and what else that takes. With `return_log_prob` the action's log-probability `[...]` is written,
+    too.
     """
 
     def __init__(
         self,
-        parameters: NestedKey | dict[str, NestedKey] = LOGITS,
-        action_key: NestedKey = ACTION,
+        parameters: NestedKey | dict[str, NestedKey] = keys.LOGITS,
+        action_key: NestedKey = keys.ACTION,
         *,
-        noise_key: NestedKey = NOISE,
+        noise_key: NestedKey = keys.NOISE,
         distribution_class: type[Distribution] = Categorical,
         distribution_kwargs: dict[str, Any] | None = None,
         return_log_prob: bool = False,
-        log_prob_key: NestedKey = LOG_PROB,
+        log_prob_key: NestedKey = keys.LOG_PROB,
     ) -> None:
         super().__init__(
             in_keys=parameters if isinstance(parameters, dict) else {"logits": parameters},
@@ -308,13 +279,13 @@ def discrete_policy(
     actions: int = 147,
     hidden: int = 64,
     head: Sequence[int] = (128, 128),
-    own_keys: Sequence[NestedKey] = (OWN,),
-    valid_key: NestedKey = VALID,
-    logits_key: NestedKey = LOGITS,
-    action_key: NestedKey = ACTION,
-    noise_key: NestedKey = NOISE,
+    own_keys: Sequence[NestedKey] = (keys.OWN,),
+    valid_key: NestedKey = keys.VALID,
+    logits_key: NestedKey = keys.LOGITS,
+    action_key: NestedKey = keys.ACTION,
+    noise_key: NestedKey = keys.NOISE,
     return_log_prob: bool = False,
-    log_prob_key: NestedKey = LOG_PROB,
+    log_prob_key: NestedKey = keys.LOG_PROB,
     encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
     """Encoder, head and a categorical over joint actions (147 = 7 accelerations x 21 steering angles: paper, III-C).

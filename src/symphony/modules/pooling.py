@@ -12,6 +12,10 @@ from torch import Tensor, nn
 
 from symphony.geometry.nearest import on_host
 
+Pooled = Float[Tensor, "n H"]
+Sets = Float[Tensor, "n K F"]
+Masks = Bool[Tensor, "n K"]
+
 PoolMode = Literal["auto", "dense", "winner"]
 ROWS = 2048
 """Elements encoded at a time on the CPU: their activations (512 KiB at width 64) stay in a core's L2 cache."""
@@ -36,14 +40,10 @@ def pool_elements(
     Masked elements have no influence whatever they hold. A set without a valid element gives zeros and no
     gradient. Among equal elements the first one receives the gradient.
 
-    Args:
-        function: row-wise network `[n, F] -> [n, H]`, e.g. :func:`symphony.modules.mlp`.
-        elements: `[..., K, F]`.
-        mask: `[..., K]` bool, True where an element is valid.
-        mode: how a gradient is made. `"dense"` differentiates through all elements, `"winner"` encodes them without
-            a graph and the at most H winners of each set again with one. Both have the same values and gradients,
-            those of any order included, up to rounding. `"auto"` is `"winner"` for large sets on the CPU, where that
-            takes half of the time, and `"dense"` elsewhere.
+    The network is `[n, F] -> [n, H]`, e.g. :func:`symphony.modules.mlp`. As for the gradient, mode `"dense"`
+    differentiates through all elements, `"winner"` encodes them without a graph and the at most H winners of each set
+    again with one. Both have the same values and gradients, those of any order included, up to rounding. `"auto"` is
+    `"winner"` for large sets on the CPU, where that takes half of the time, and `"dense"` elsewhere.
     """
     if mask.shape != elements.shape[:-1] or mask.dtype != torch.bool:
         raise ValueError(
@@ -74,9 +74,7 @@ def _wants_gradient(function: Function, elements: Float[Tensor, "*b K F"]) -> bo
     return any(p.requires_grad for p in function.parameters())
 
 
-def _maxima(
-    function: Function, sets: Float[Tensor, "n K F"], valid: Bool[Tensor, "n K"]
-) -> Float[Tensor, "n H"]:
+def _maxima(function: Function, sets: Sets, valid: Masks) -> Pooled:
     """Maxima without a gradient, 0 for sets without an element."""
     n, count, features = sets.shape
     if not on_host(valid):
@@ -110,17 +108,13 @@ def _encoded(
     return found.new_full(shape, -torch.inf).index_copy(dim, place, found)
 
 
-def _dense(
-    function: Function, sets: Float[Tensor, "n K F"], valid: Bool[Tensor, "n K"]
-) -> Float[Tensor, "n H"]:
+def _dense(function: Function, sets: Sets, valid: Masks) -> Pooled:
     encoded = _encoded(function, sets.flatten(0, 1), valid.flatten()).unflatten(0, valid.shape)
     # Not amax, which would share the gradient between equal elements.
     return torch.where(valid.any(1, keepdim=True), encoded.max(1).values, 0.0)
 
 
-def _through_winners(
-    function: Function, sets: Float[Tensor, "n K F"], valid: Bool[Tensor, "n K"]
-) -> Float[Tensor, "n H"]:
+def _through_winners(function: Function, sets: Sets, valid: Masks) -> Pooled:
     """Output channel c of the element that has its maximum there: the other elements get no gradient anyway."""
     n, count, features = sets.shape
     flat, each, places = sets.reshape(n * count, features), max(1, ROWS // count), []
@@ -156,9 +150,7 @@ def _split(function: Function) -> tuple[Function, nn.Linear | None]:
     return function, None
 
 
-def _own_channel(
-    before: Function, last: nn.Linear | None, chosen: Float[Tensor, "n H F"]
-) -> Float[Tensor, "n H"]:
+def _own_channel(before: Function, last: nn.Linear | None, chosen: Float[Tensor, "n H F"]) -> Pooled:
     """Output channel c of element c; of a last layer one output in H is computed."""
     hidden = before(chosen.flatten(0, 1)).unflatten(0, chosen.shape[:2])
     return hidden.diagonal(dim1=1, dim2=2) if last is None else (hidden * last.weight).sum(-1) + last.bias

@@ -12,15 +12,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from symphony.keys import GAP, GAP_AHEAD, OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, ROAD, SCORE, VALID
-from symphony.modules.encoder import (
-    FORESIGHT,
-    ElementGroup,
-    SceneEncoder,
-    SceneNetwork,
-    gap_features,
-    road_features,
-    scene_module,
-)
+from symphony.modules import encoder
 
 Features = Literal["paper", "clearance", "foresight"]
 _GAP, _ROAD = 3, 2 * 5
@@ -31,16 +23,11 @@ class Discriminator(nn.Module):
 
     The logit is high for states that look simulated: D = sigmoid(logit) is the probability of that.
 
-    Args:
-        own_features: of the agent itself, its route included where it is given one.
-        object_features: of one object; the first two are its position in the agent's frame.
-        point_features: of one map or light point; the first two are its position in the agent's frame.
-        radius: how far it observes, in the units of those positions.
-        hidden: width of the encoders.
-        head: widths of the head's hidden layers.
-        features: ``paper``; ``clearance``, which adds the signed gap to the box of each object and the signed
-            distances of centre and corners to the edge of the road; or ``foresight``, which adds to these the gaps at
-            :data:`FORESIGHT`, were everyone to keep speed and course.
+    Own features include the route where there is one; the first two of an object and of a map or light point are its
+    position in the agent's frame, in whose units ``radius`` says how far it observes. ``features`` are ``paper``;
+    ``clearance``, which adds the signed gap to the box of each object and the signed distances of centre and corners
+    to the edge of the road; or ``foresight``, which adds to these the gaps at :data:`FORESIGHT`, were everyone to
+    keep speed and course.
     """
 
     def __init__(
@@ -58,9 +45,11 @@ class Discriminator(nn.Module):
         self.radius, self.clearance = radius, features != "paper"
         widths = (own_features, object_features, point_features)
         if self.clearance:
-            gaps = 1 + len(FORESIGHT) if features == "foresight" else 1
+            gaps = 1 + len(encoder.FORESIGHT) if features == "foresight" else 1
             widths = (own_features + _ROAD, object_features + _GAP * gaps, point_features)
-        self.network = SceneNetwork(SceneEncoder(widths[0], widths[1:], hidden=hidden), 1, head=head)
+        self.network = encoder.SceneNetwork(
+            encoder.SceneEncoder(widths[0], widths[1:], hidden=hidden), 1, head=head
+        )
 
     def forward(
         self,
@@ -79,8 +68,8 @@ class Discriminator(nn.Module):
         objects_mask = objects_mask & self._near(objects)
         points_mask = points_mask & self._near(points)
         if road is not None and self.clearance:
-            own = torch.cat([own, road_features(road)], -1)
-            known = [gap_features(gap).flatten(objects.ndim - 1) for gap in gaps]
+            own = torch.cat([own, encoder.road_features(road)], -1)
+            known = [encoder.gap_features(gap).flatten(objects.ndim - 1) for gap in gaps]
             objects = torch.cat([objects, *known], -1)
         logits = self.network(own, valid, objects, objects_mask, points, points_mask)
         return torch.where(valid, logits.squeeze(-1), 0.0)
@@ -115,8 +104,10 @@ def discriminator(
         features=features,
     )
     groups = (
-        ElementGroup(OBJECTS, OBJECTS_MASK, object_features),
-        ElementGroup(POINTS, POINTS_MASK, point_features),
+        encoder.ElementGroup(OBJECTS, OBJECTS_MASK, object_features),
+        encoder.ElementGroup(POINTS, POINTS_MASK, point_features),
     )
     more = {"paper": (), "clearance": (ROAD, GAP), "foresight": (ROAD, GAP, GAP_AHEAD)}[features]
-    return scene_module(network, groups, out_key, own_keys=own_keys, valid_key=valid_key, more_keys=more)
+    return encoder.scene_module(
+        network, groups, out_key, own_keys=own_keys, valid_key=valid_key, more_keys=more
+    )

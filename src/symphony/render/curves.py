@@ -20,7 +20,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from symphony.errors import ConfigError, DataError
-from symphony.render.style import AGENT_COLORS, INK, LANE, new_figure, picture_path, save
+from symphony.render.style import AGENT_COLORS, INK, LANE, new_panels, picture_path, save
 
 Records = Sequence[Mapping[str, Any]]
 """Records of a run, each with its ``step``; other entries are metrics, and any may be absent or NaN."""
@@ -58,15 +58,10 @@ def plot_curves(
 ) -> Figure:
     """Draw the metrics of runs over their updates: pale as recorded, strong smoothed, one colour per run.
 
-    Args:
-        runs: records of each run by its name.
-        path: file to write (png, pdf or svg).
-        metrics: draw these only, each in a panel of its own; by default all there are, related ones together.
-        window: share of a run's records that a point of the smoothed line is averaged over; 0 to not smooth.
-        columns: panels per row, at most.
-
-    Raises:
-        ConfigError: nothing to draw, a metric that no run has, a window out of range, or a file of another kind.
+    Given metrics have a panel each; by default there are all, related ones together, at most ``columns`` in a row. A
+    point of the smoothed line is averaged over a share (``window``) of a run's records; 0 to not smooth. Raises a
+    :class:`ConfigError` for nothing to draw, a metric that no run has, a window out of range, or a file that is no
+    png, pdf or svg.
     """
     file = picture_path(path)
     if not 0 <= window <= 1:
@@ -78,7 +73,7 @@ def plot_curves(
     panels = {metric: [metric] for metric in metrics} or panels_of(present)
     if not panels:
         raise ConfigError("no metrics to draw")
-    figure, slots = _grid(len(panels), min(columns, len(panels)), 3.3, 2.3)
+    figure, slots = new_panels(len(panels), min(columns, len(panels)), 3.3, 2.3, 0.5)
     colors = dict(zip(runs, run_colors(len(runs)), strict=True))
     for axes, (title, names) in zip(slots, panels.items(), strict=True):
         _style(axes, title)
@@ -152,12 +147,8 @@ def plot_curvature(
 
     Bars are shares of all visits, on a root scale: most regions are straight, and the turns are what is to be seen.
 
-    Args:
-        panels: by title, counts [K] of rollouts and of the log in K bins centred at equal steps from -1 to 1 (1/m).
-        path: file to write (png, pdf or svg).
-        columns: panels per row, at most.
-
-    Raises a :class:`DataError` where no region was visited, or counts differ in their number of bins.
+    Takes, by title, counts [K] of rollouts and of the log in K bins centred at equal steps from -1 to 1 (1/m). Raises
+    a :class:`DataError` where no region was visited, or counts differ in their number of bins.
     """
     file = picture_path(path)
     for title, pair in panels.items():
@@ -169,7 +160,7 @@ def plot_curvature(
     centres, width = np.linspace(-1, 1, len(every[0])), 2 / (len(every[0]) - 1)
     reach = max(LEAST_REACH, *(np.abs(centres[shares > 0]).max() for shares in every)) + 2 * width
     columns = min(columns, len(panels))
-    figure, slots = _grid(len(panels), columns, 4.2, 2.9)
+    figure, slots = new_panels(len(panels), columns, 4.2, 2.9, 0.5)
     for axes, title, policy, log in zip(slots, panels, every[::2], every[1::2], strict=True):
         _style(axes, fill(title, TITLE))
         edges = np.append(centres - width / 2, centres[-1] + width / 2)
@@ -188,14 +179,6 @@ def plot_curvature(
     figure.legend(handles=handles, loc="outside upper right", ncols=2, frameon=False, fontsize=9)
     save(figure, file)
     return figure
-
-
-def _grid(count: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure of panels, each so many inches wide and high."""
-    rows = -(-count // columns)
-    figure = new_figure(width * columns, height * rows + 0.5)
-    grid = figure.add_gridspec(rows, columns)
-    return figure, [figure.add_subplot(grid[k // columns, k % columns]) for k in range(count)]
 
 
 def _style(axes: Axes, title: str) -> None:

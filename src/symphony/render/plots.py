@@ -27,7 +27,7 @@ from symphony.render.style import (
     add_legend,
     agent_color,
     frame,
-    new_figure,
+    new_panels,
     open_target,
     picture_path,
     save,
@@ -56,15 +56,9 @@ def plot_segment(
 ) -> Axes:
     """Draw a run segment: map, lights and boxes at one step, trails over the whole window.
 
-    Args:
-        segment: what to draw.
-        target: file to write (png, pdf or svg) or axes to draw on.
-        step: when the boxes and lights are shown; by default the segment's ``current_step``.
-        interactive: agents in colour, along with the ego; by default the segment's ``interest``.
-        view: limits in metres; by default around the trails of the agents in colour, on given axes a square.
-        title: by default the segment's id.
-
-    Raises a :class:`ConfigError` for a file of another kind.
+    The target is a file (png, pdf or svg; a :class:`ConfigError` for another) or axes to draw on. By default boxes
+    and lights are those of the ``current_step``, and the segment's ``interest`` is in colour, as the ego is; the
+    view, in metres, is around the trails of those in colour, on given axes a square.
     """
     step = segment.current_step if step is None else step
     named = segment.interest.tolist() if interactive is None else interactive
@@ -249,12 +243,9 @@ def plot_grid(
     on so many inches; there are at most ``columns`` in a row.
     """
     file = picture_path(path)
-    columns = min(columns, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = new_figure(size * columns, size * rows)
-    grid = figure.add_gridspec(rows, columns)
-    for k, draw in enumerate(panels):
-        draw(figure.add_subplot(grid[k // columns, k % columns]))
+    figure, slots = new_panels(len(panels), min(columns, len(panels)), size, size)
+    for draw, axes in zip(panels, slots, strict=True):
+        draw(axes)
     save(figure, file)
     return figure
 

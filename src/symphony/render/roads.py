@@ -15,9 +15,8 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
-from symphony.data.segment import LaneType, MarkType, Polylines, RoadMap, RunSegment, SignalState
+from symphony.data.segment import MarkType, Polylines, RoadMap, RunSegment, SignalState
 from symphony.render.style import AGENT_COLORS, BOUNDARY, CAUTION, GO, INK, LANE, MARK, ROAD, STOP, View
-from symphony.render.viewer.pack import BIKE_WIDTH, DEFAULT_WIDTH
 
 CORNERS = np.array([(0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5)])
 NOSE = np.array([(0.46, 0.0), (0.12, 0.36), (0.12, -0.36)])
@@ -172,9 +171,7 @@ def road_ribbon(road: RoadMap, lane: int) -> Any:
     """Area covered by one lane: its centre line widened to its width; none for a lane of a single point."""
     if len(road.lanes[lane]) < 2:
         return shapely.Polygon()
-    width = road.lane_width[lane]
-    if not np.isfinite(width):
-        width = BIKE_WIDTH if road.lane_type[lane] == LaneType.BIKE_LANE else DEFAULT_WIDTH
+    width = road.widths[lane]
     # A little wider than the lane, or hairlines of land would show between neighbours.
     return shapely.LineString(road.lanes[lane][:, :2]).buffer(width / 2 + 0.15, quad_segs=4, cap_style="flat")
 

@@ -46,6 +46,16 @@ def new_figure(width: float = 8.0, height: float = 8.0) -> Figure:
     return figure
 
 
+def new_panels(
+    count: int, columns: int, width: float, height: float, head: float = 0.0
+) -> tuple[Figure, list[Axes]]:
+    """A figure of panels, each so many inches wide and high, with room above them."""
+    rows = -(-count // columns)
+    figure = new_figure(width * columns, height * rows + head)
+    grid = figure.add_gridspec(rows, columns)
+    return figure, [figure.add_subplot(grid[k // columns, k % columns]) for k in range(count)]
+
+
 def open_target(target: Target, view: View) -> tuple[Axes, Path | None]:
     """Axes to draw on, and where to save them afterwards (None for axes given by the caller)."""
     if isinstance(target, Axes):

@@ -110,15 +110,9 @@ class Regions:
 class LaneGraph:
     """Lanes, how they connect, and their shapes; built once per map.
 
-    Lanes of an excluded type, and those that are a single point (WOMD has some, as stubs), keep their index but
-    are not connected to anything and match no position.
-
-    Args:
-        road: a :class:`symphony.data.segment.RoadMap`.
-        exclude: lane types to leave out.
-
-    Raises:
-        DataError: a connection to a lane that does not exist.
+    Lanes of an excluded type, and those that are a single point (WOMD has some, as stubs), keep their index but are
+    not connected to anything and match no position. Takes a :class:`symphony.data.segment.RoadMap`, and raises a
+    :class:`DataError` for a connection to a lane that does not exist.
 
     Attributes:
         lines: centre lines [P_k, 2], float64, repeated points dropped.

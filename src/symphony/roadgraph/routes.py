@@ -13,18 +13,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from symphony.geometry.polylines import stations_along, to_pieces
+from symphony.roadgraph import paths
 from symphony.roadgraph.graph import LaneGraph, Reals, turn_between
-from symphony.roadgraph.paths import (
-    CHORD,
-    arc_lengths,
-    at,
-    beside,
-    blend,
-    centre_line,
-    followed,
-    gentle,
-    sharpest,
-)
 
 HORIZON = 240.0  # metres ahead up to which routes take every branch: 10 s at 20 m/s and a margin
 LIMIT = 200  # most routes a vehicle gets
@@ -158,11 +148,11 @@ def _change_at(graph: LaneGraph, lane: int, other: int, start: float) -> tuple[f
     where the two are not side by side.
     """
     line, target = graph.lines[lane], graph.lines[other]
-    begins = max(start, beside(line, target[0])[0])
+    begins = max(start, paths.beside(line, target[0])[0])
     if begins >= graph.length[lane]:
         return None
-    point = at(line, graph.arc[lane], np.array([begins]))[0]
-    onto, away = beside(target, point)
+    point = paths.at(line, graph.arc[lane], np.array([begins]))[0]
+    onto, away = paths.beside(target, point)
     if onto >= graph.length[other] or away > CHANGE_WIDTH:
         return None
     headings = []
@@ -197,8 +187,8 @@ def route_line(
     same.
     """
     if not route.change:
-        return centre_line(graph, route.lanes, start)
-    reach, end = change_length(speed) + CHORD, route.change + 1
+        return paths.centre_line(graph, route.lanes, start)
+    reach, end = change_length(speed) + paths.CHORD, route.change + 1
     beyond = float(graph.length[route.lanes[route.change]]) - route.beside
     while end < len(route.lanes) and beyond < reach:
         beyond += float(graph.length[route.lanes[end]])
@@ -210,27 +200,29 @@ def route_line(
     line = changes[near]
     if line is None:
         return None
-    return np.concatenate([line, *(followed(graph, *pair) for pair in pairwise(route.lanes[end - 1 :]))])
+    return np.concatenate(
+        [line, *(paths.followed(graph, *pair) for pair in pairwise(route.lanes[end - 1 :]))]
+    )
 
 
 def _changed(graph: LaneGraph, route: Route, start: float, speed: float) -> Reals | None:
     """The line of a route with a change; None if nobody can drive it."""
     before, after = route.lanes[: route.change], route.lanes[route.change :]
     left, arc = graph.lines[before[-1]], graph.arc[before[-1]]
-    point = at(left, arc, np.array([route.begins]))[0]
-    kept = centre_line(graph, before, start)
-    along = arc_lengths(kept)
+    point = paths.at(left, arc, np.array([route.begins]))[0]
+    kept = paths.centre_line(graph, before, start)
+    along = paths.arc_lengths(kept)
     kept = kept[along < along[-1] - (arc[-1] - route.begins) - 1e-3]
-    target = centre_line(graph, after, route.beside)
-    along = arc_lengths(target)
+    target = paths.centre_line(graph, after, route.beside)
+    along = paths.arc_lengths(target)
     for length in (change_length(speed), change_length(speed) / 2):
         if along[-1] < length:
             continue
-        way = blend(target, point, length)
-        if all(gentle(graph, lane) for lane in (before[-1], *after)):
+        way = paths.blend(target, point, length)
+        if all(paths.gentle(graph, lane) for lane in (before[-1], *after)):
             return np.concatenate([kept, way])
-        part = np.concatenate([kept[-1:], way[arc_lengths(way) <= length + CHORD]])
-        if sharpest(part) <= sharpest(target[along <= length + CHORD]) + CHANGE_TURN:
+        part = np.concatenate([kept[-1:], way[paths.arc_lengths(way) <= length + paths.CHORD]])
+        if paths.sharpest(part) <= paths.sharpest(target[along <= length + paths.CHORD]) + CHANGE_TURN:
             return np.concatenate([kept, way])
     return None
 
@@ -289,10 +281,10 @@ def ends_inside(graph: LaneGraph, line: Reals) -> bool:
 
 def resampled(line: Reals, spacing: float, length: float = np.inf) -> Reals:
     """Points [Q, 2], Q >= 2, of a line so many metres apart, up to a length; the last piece may be shorter."""
-    arc = arc_lengths(line)
+    arc = paths.arc_lengths(line)
     end = min(length, arc[-1])
     places = np.append(np.arange(0.0, end - 1e-6, spacing), end)
-    return at(line, arc, places if len(places) > 1 else np.array([0.0, end]))
+    return paths.at(line, arc, places if len(places) > 1 else np.array([0.0, end]))
 
 
 def route_errors(
@@ -327,7 +319,8 @@ def route_errors(
     if twice.any():
         same = np.broadcast_to(path, (int(twice.sum()), *path.shape))
         places = stations_along(padded[twice], same, np.ones(same.shape[:2], bool))
-        on = [at(line, arc_lengths(line), place) for line, place in zip(padded[twice], places, strict=True)]
+        pairs = zip(padded[twice], places, strict=True)
+        on = [paths.at(line, paths.arc_lengths(line), place) for line, place in pairs]
         errors[twice] = np.linalg.norm(np.stack(on) - same, axis=-1).mean(-1)
     return errors[number]
 

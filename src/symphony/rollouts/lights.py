@@ -126,7 +126,7 @@ def _planned(
     # Who is amber while others are green comes to red first.
     ends = np.array([amber - _since(row[None], np.ones(1, bool)) * dt for row in ambers])
     slows |= (ambers[:, -1] & ~now)[:, None] & (np.arange(steps) * dt < ends[:, None] - 1e-6)
-    arrow = np.isin(state, ARROW).any(1)[:, None]
+    arrow = np.isin(state, ARROW).any(1, keepdims=True)
     kinds = [
         np.where(arrow, *pair)
         for pair in zip(ARROW[::-1], (*GREEN[:1], *AMBER[:1], SignalState.STOP), strict=True)

@@ -13,16 +13,8 @@ from symphony.data.npz import read_npz
 from symphony.data.report import Skip
 from symphony.errors import DataError
 from symphony.parallel import ordered_map
+from symphony.wosac import scorer
 from symphony.wosac.records import logged_scenario, parse_scenario, read_scenarios
-from symphony.wosac.scorer import (
-    CHALLENGES,
-    SimulatedRollouts,
-    check_scored,
-    compute_features,
-    mean_scores,
-    object_scores,
-    score_features,
-)
 from symphony.wosac.scorer.config import ROLLOUTS
 from symphony.wosac.scorer.scenario import STATES
 
@@ -32,7 +24,7 @@ Packed = tuple[Path, int, bytes, Path]
 """A scenario's file, its number in it, its record, and the file of its rollouts."""
 
 
-def read_rollouts(file: Path) -> SimulatedRollouts:
+def read_rollouts(file: Path) -> scorer.SimulatedRollouts:
     """Read an ``.npz`` with ``object_id`` [n] and ``x``, ``y``, ``z``, ``heading`` [R, n, 80]; more is left alone.
 
     Raises:
@@ -51,7 +43,7 @@ def read_rollouts(file: Path) -> SimulatedRollouts:
         plain = np.int64 if whole else np.float32 if held[name].dtype.itemsize <= 4 else np.float64
         with np.errstate(over="ignore"):
             arrays[name] = held[name].astype(plain)
-    return SimulatedRollouts(**arrays)
+    return scorer.SimulatedRollouts(**arrays)
 
 
 @dataclass(frozen=True)
@@ -67,11 +59,11 @@ class ScoreFile:
         there is nothing.
         """
         file, record, payload, rollouts = packed
-        parsed, config = parse_scenario(payload, file, record), CHALLENGES[self.config]
+        parsed, config = parse_scenario(payload, file, record), scorer.CHALLENGES[self.config]
         name = parsed.scenario_id
         try:
             scenario = logged_scenario(parsed)
-            check_scored(scenario, config)
+            scorer.check_scored(scenario, config)
         except DataError as error:
             if self.strict:
                 raise error.at(file=file, segment=name) from None
@@ -81,9 +73,9 @@ class ScoreFile:
             made.check(scenario.sim_agents, count=ROLLOUTS)
         except DataError as error:
             raise error.at(file=rollouts, segment=name) from None
-        found = compute_features(scenario, made)
-        objects = {"objects": object_scores(found, config)} if self.per_object else {}
-        return {"scenario_id": name, **score_features(found, config), **objects}
+        found = scorer.compute_features(scenario, made)
+        objects = {"objects": scorer.object_scores(found, config)} if self.per_object else {}
+        return {"scenario_id": name, **scorer.score_features(found, config), **objects}
 
 
 def score_files(
@@ -127,7 +119,7 @@ def score_files(
     return {
         "config": config,
         "scenario_count": len(results),
-        **mean_scores(numbers),
+        **scorer.mean_scores(numbers),
         "scenarios": results,
         "left_out": [skip.to_json() for skip in skipped],
     }, skipped

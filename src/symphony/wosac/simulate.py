@@ -60,15 +60,20 @@ def standing(segment: RunSegment) -> NDArray[np.bool_]:
     still = np.where(segment.valid[:, past], away, 0.0).max(1) <= STILL
     still &= np.linalg.norm(segment.velocity[:, now], axis=-1) <= 2 * STILL
     still &= segment.valid[:, now] & (segment.agent_type == AgentType.VEHICLE)
-    # The latest state seen of each light, and where it is in the frame of each vehicle.
-    seen = segment.signal_state[:, now::-1]
-    shown = seen[np.arange(len(seen)), (seen != SignalState.UNKNOWN).argmax(1)]
+    # Where each light is in the frame of each vehicle.
+    shown = _latest(segment)
     delta = segment.signal_point[None, :, :2] - segment.position[:, now, None, :2]
     cos, sin = np.cos(segment.heading[:, now, None]), np.sin(segment.heading[:, now, None])
     along, aside = cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]
     own = (along > 0) & (along < AHEAD) & (np.abs(aside) < ASIDE)
     green, red = ((own & np.isin(shown, states)).any(1) for states in (_GO, _STOP))
     return np.asarray(still & ~(green & ~red))
+
+
+def _latest(segment: RunSegment) -> NDArray[np.uint8]:
+    """[Q] the latest known state of each light up to the current step."""
+    seen = segment.signal_state[:, segment.current_step :: -1]
+    return seen[np.arange(len(seen)), (seen != SignalState.UNKNOWN).argmax(1)]
 
 
 def walks(
@@ -200,9 +205,6 @@ def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSeg
     velocity = segment.velocity[rows, now].astype(np.float64)
     path = np.repeat(segment.position[rows, now, None].astype(np.float64), steps, 1)
     path[..., :2] += velocity[:, None] * (np.arange(steps) * dt)[:, None]
-    # The latest known state of each light up to the current step.
-    seen = segment.signal_state[:, now::-1]
-    latest = seen[np.arange(len(seen)), (seen != SignalState.UNKNOWN).argmax(1)]
     return _from_now_on(
         segment,
         rows,
@@ -211,7 +213,7 @@ def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSeg
         heading=np.repeat(segment.heading[rows, now, None], steps, 1),
         velocity=np.repeat(segment.velocity[rows, now, None], steps, 1),
         valid=np.ones((len(rows), steps), bool),
-        signal_state=np.repeat(latest[:, None], steps, 1),
+        signal_state=np.repeat(_latest(segment)[:, None], steps, 1),
     )
 
 

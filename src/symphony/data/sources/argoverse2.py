@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from symphony.data import segment as schema
 from symphony.data.segment import MAX_STEPS, AgentType, Bools, LaneType, MarkType, RoadMap, RunSegment
-from symphony.data.sources import lines
+from symphony.data.sources import base, lines
 from symphony.data.sources.base import Doubles, Item, Reader, T, located, motion, read_whole, readable, refuse
 from symphony.data.sources.lines import Lane
 from symphony.errors import ConfigError, DataError
@@ -56,7 +56,6 @@ NO_TYPE = "an agent of a type that is not known"
 MAX_ROWS = 500_000  # states of a scenario; the dataset's have some thousand
 MAX_TEXT = 64  # characters of an id
 MAX_BYTES = 256 << 20  # bytes of the columns, decompressed
-MAX_COORDINATE = 1e8  # larger magnitudes are no metres of a city
 TILE = 10.0
 """Metres: maps are cut along the axes at whole multiples of it (30 in the files that were looked at)."""
 CUT_TOLERANCE = 0.011  # metres by which an edge may miss such a line: coordinates are kept to the centimetre
@@ -346,5 +345,4 @@ def _points(points: list[Any]) -> Doubles:
     wrong = type(points) is not list or any(type(n) not in {int, float} for row in rows for n in row)
     refuse(wrong, "not a list of points with the numbers x and y")
     found = np.array(rows, np.float64).reshape(len(rows), 2)
-    refuse(not (np.abs(found) <= MAX_COORDINATE).all(), "a coordinate that is not finite or absurdly large")
-    return found
+    return base.finite(found)

@@ -38,14 +38,10 @@ class Reader(ABC):
     """Turns the files of one format into run segments at the log's own rate.
 
     A segment whose ``group`` a reader leaves empty is a group of its own.
-
-    Attributes:
-        name: name of the format, also :attr:`RunSegment.source`.
-        patterns: file-name patterns the format's files go by, for searching a folder.
     """
 
-    name: ClassVar[str]
-    patterns: ClassVar[tuple[str, ...]]
+    name: ClassVar[str]  # name of the format, also :attr:`RunSegment.source`
+    patterns: ClassVar[tuple[str, ...]]  # file-name patterns the format's files go by, for searching a folder
 
     def read(self, path: str | Path) -> Iterator[Item]:
         """Yield one item per record of a file, in file order; no file makes it raise.
@@ -178,6 +174,12 @@ def number(text: str | None, field: str) -> float:
     if not abs(value) <= MAX_NUMBER:
         raise DataError(f"{value:g} is not finite or absurdly large", field=field)
     return value
+
+
+def finite(points: Doubles) -> Doubles:
+    """Return points if all their coordinates are finite and at most :data:`MAX_NUMBER`."""
+    refuse(not (np.abs(points) <= MAX_NUMBER).all(), "a coordinate that is not finite or absurdly large")
+    return points
 
 
 def integer(text: str | None, field: str) -> int:

@@ -35,7 +35,6 @@ from symphony.data.sources.lines import Lane, Lights, Links
 from symphony.data.sources.safe_pickle import Array, load_plain
 from symphony.errors import DataError
 
-MAX_COORDINATE = 1e8  # larger magnitudes are no metres of a city
 MEETS = 0.5  # metres within which a lane's end meets another's start
 TURN = np.deg2rad(60)  # largest angle between the two there
 HALF_WIDTH = 1.75  # metres on either side of a centre line that are drivable where the map has no area
@@ -361,5 +360,4 @@ def _points(value: Any) -> Doubles:
     if found.size == 0:
         return np.zeros((0, 2))
     refuse(found.ndim != 2 or found.shape[1] not in {2, 3}, f"shape {found.shape}, expected [points, 2 or 3]")
-    refuse(not (np.abs(found) <= MAX_COORDINATE).all(), "a coordinate that is not finite or absurdly large")
-    return found
+    return base.finite(found)

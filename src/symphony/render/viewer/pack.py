@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.segment import LaneType, Polylines, content_hash
+from symphony.data.segment import Polylines, content_hash
 from symphony.errors import DataError
 from symphony.files import finite
 
@@ -98,7 +98,6 @@ def filled(page: str, parts: Mapping[str, str]) -> str:
 
 
 _TYPES = {"i32": np.int32, "i16": np.int16, "u8": np.uint8, "f32": np.float32}
-DEFAULT_WIDTH, BIKE_WIDTH = 3.6, 1.6  # metres, for lanes whose width the source does not give
 MILLIMETRE, CENTIMETRE, ANGLE = 1e-3, 1e-2, 1e-4
 """What places (metres), sizes and speeds (metres, m/s) and headings (radians) are rounded to."""
 FAR = 10.2  # seconds to a collision above which the page knows none
@@ -227,10 +226,8 @@ def packed_log(saved: SavedRollouts) -> str:
         packer.add(f"lights.{letter}", "i32", segment.signal_point[:, axis], MILLIMETRE)
     packer.add("lights.state", "u8", segment.signal_state[:, within])
     road = segment.road
-    default = np.where(road.lane_type == LaneType.BIKE_LANE, BIKE_WIDTH, DEFAULT_WIDTH)
     packer.lines("lanes", road.lanes)
-    width = np.where(np.isnan(road.lane_width), default, road.lane_width)
-    packer.add("lanes.width", "i16", width, CENTIMETRE)
+    packer.add("lanes.width", "i16", road.widths, CENTIMETRE)
     packer.lines("boundary", road.boundary)
     packer.lines("marks", road.marks)
     packer.add("marks.type", "u8", road.mark_type)

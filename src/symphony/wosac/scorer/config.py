@@ -16,8 +16,8 @@ class Component:
     """A component of the score."""
 
     weight: float  # its weight in the metametric
-    # (low, high, number of bins) of the histogram of a number, in m, s and rad; what lies outside counts as
-    # low or high. None for a yes or no, such as whether an object ever collides.
+    #: (low, high, number of bins) of the histogram of a number, in m, s and rad; what lies outside counts as
+    #: low or high. None for a yes or no, such as whether an object ever collides.
     bins: tuple[float, float, int] | None = None
 
 

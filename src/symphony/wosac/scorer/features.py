@@ -78,7 +78,7 @@ class _Tracks(NamedTuple):
     it was, and a future that is valid throughout. Boxes have the size of step 10 throughout.
     """
 
-    # [n] of the scenario's objects: the E evaluated ones first, by ascending id, then the others
+    #: [n] of the scenario's objects: the E evaluated ones first, by ascending id, then the others
     rows: np.ndarray
     evaluated: int  # E
     x: Tensor  # [R, n, 91]

@@ -85,7 +85,7 @@ class Signals:
 
     lane: Int[Tensor, " Q"]  # id of the lane
     red: Bool[Tensor, "Q T"]
-    # [Q, T, 2] where to stop, the world's origin at steps without an observation
+    #: [Q, T, 2] where to stop, the world's origin at steps without an observation
     point: Float[Tensor, "Q T 2"]
 
     @classmethod

@@ -28,45 +28,28 @@ class WosacScenario:
     World frame and headings as logged: part of the score depends on where the origin is and on headings that are not
     brought into one turn. States that are not valid hold whatever the log holds there.
 
-    Attributes:
-        scenario_id: its id.
-        object_id: [A] of all tracks.
-        object_type: [A] 1 vehicle, 2 pedestrian, 3 cyclist, 4 other.
-        position: [A, 91, 3] box centres, metres.
-        heading: [A, 91] radians.
-        size: [A, 3] length, width and height at step 10, metres.
-        valid: [A, 91].
-        evaluated: [E] ids of the objects that are scored: the recording vehicle and those to predict.
-        road_edges: arrays [P, 3], metres: boundaries of the drivable area, which is on their left.
-        lanes: arrays [P, 3], metres: centre lines of K lanes.
-        lane_id: [K].
-        lane_type: [K] 2 is a lane of a surface street.
-        signal_step: [M] step of each observation of a traffic light.
-        signal_lane: [M] id of the lane it is for.
-        signal_state: [M] 1 and 4 are red (arrow stop, stop).
-        signal_point: [M, 2] where to stop, metres.
-        future: steps after step 10, all of which are simulated and scored; the challenge's 80, or fewer for logs that
-            are shorter. "91" above and in what is made of a scenario is 11 more than this.
-
     Raises a :class:`DataError` where it can't be scored; names scenario, field and agent.
     """
 
-    scenario_id: str
-    object_id: Ints
-    object_type: Ints
-    position: Reals
-    heading: Reals
-    size: Reals
-    valid: NDArray[np.bool_]
-    evaluated: Ints
+    scenario_id: str  # its id
+    object_id: Ints  # [A] of all tracks
+    object_type: Ints  # [A] 1 vehicle, 2 pedestrian, 3 cyclist, 4 other
+    position: Reals  # [A, 91, 3] box centres, metres
+    heading: Reals  # [A, 91] radians
+    size: Reals  # [A, 3] length, width and height at step 10, metres
+    valid: NDArray[np.bool_]  # [A, 91]
+    evaluated: Ints  # [E] ids of the objects that are scored: the recording vehicle and those to predict
+    #: arrays [P, 3], metres: boundaries of the drivable area, which is on their left
     road_edges: Sequence[Reals]
-    lanes: Sequence[Reals]
-    lane_id: Ints
-    lane_type: Ints
-    signal_step: Ints
-    signal_lane: Ints
-    signal_state: Ints
-    signal_point: Reals
+    lanes: Sequence[Reals]  # arrays [P, 3], metres: centre lines of K lanes
+    lane_id: Ints  # [K]
+    lane_type: Ints  # [K] 2 is a lane of a surface street
+    signal_step: Ints  # [M] step of each observation of a traffic light
+    signal_lane: Ints  # [M] id of the lane it is for
+    signal_state: Ints  # [M] 1 and 4 are red (arrow stop, stop)
+    signal_point: Reals  # [M, 2] where to stop, metres
+    #: steps after step 10, all of which are simulated and scored; the challenge's 80, or fewer for logs that
+    #: are shorter. "91" above and in what is made of a scenario is 11 more than this.
     future: int = FUTURE
 
     def __post_init__(self) -> None:
@@ -100,19 +83,13 @@ class WosacScenario:
 
 @dataclass(frozen=True)
 class SimulatedRollouts:
-    """R simulated futures of a scenario: steps 11 to 90 of every agent that is valid at step 10, in any order.
+    """R simulated futures of a scenario: steps 11 to 90 of every agent that is valid at step 10, in any order."""
 
-    Attributes:
-        object_id: [n].
-        x, y, z: [R, n, 80] box centres in the world frame of the log, metres.
-        heading: [R, n, 80] radians.
-    """
-
-    object_id: Ints
-    x: Reals
-    y: Reals
-    z: Reals
-    heading: Reals
+    object_id: Ints  # [n]
+    x: Reals  # [R, n, 80] box centres in the world frame of the log, metres
+    y: Reals  # [R, n, 80] box centres in the world frame of the log, metres
+    z: Reals  # [R, n, 80] box centres in the world frame of the log, metres
+    heading: Reals  # [R, n, 80] radians
 
     def check(self, agents: Ints | None = None, future: int = FUTURE, count: int | None = None) -> None:
         """See that all is there and finite, and as many agents, steps and rollouts as there must be.
