@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -14,12 +15,17 @@ import torch
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony import keys
+from symphony.agents import load_agent
+from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.dynamics import Bicycle
 from symphony.envs.observation import ObservationConfig
 from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
+from symphony.learning.demonstrations import SceneDataset
+from symphony.planners.interface import Pose
+from symphony.saved.saving import save_simulation
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra 'gym'")
 
@@ -64,6 +70,43 @@ def test_it_is_the_driving_environment(store):
         now = after.exclude(keys.REWARD)
     assert info["step"] == segment.num_steps - 1
     assert info["segment"] == "crossing-0"
+
+
+def test_it_sees_what_a_planner_sees(store, tmp_path):
+    """The same record, where a planner drives as it did."""
+    env = gymnasium.make(NAME, data=store, observation=SMALL, ends_on=()).unwrapped
+    env.reset(options={"segment": "crossing-0"})
+    mine, states, told = [], [], []
+    for action in np.random.default_rng(0).integers(env.action_space.n, size=8):
+        mine.append(env.seen())
+        states.append(env.step(int(action))[-1]["state"].tolist())
+
+    def follows(seen):
+        told.append(seen)
+        return Pose(*states[seen.step])
+
+    agent = load_agent("playback")
+    data = SceneDataset(SegmentStore(store), 1, agent.dynamics, [1], routes=True)
+    (saved,) = save_simulation(tmp_path / "sim", agent, data, EvaluateConfig(rollouts=1), planner=follows)
+    np.testing.assert_allclose(saved.state[0, 1:, 0], states, atol=1e-4)
+    assert len(mine) == len(told) == saved.steps
+    for one, other in zip(mine, told, strict=True):
+        same(dataclasses.asdict(one) | {"seed": 0}, dataclasses.asdict(other) | {"seed": 0})
+
+
+def same(one, other):
+    """Records, tuples and arrays of the same numbers."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        one, other = tuple(one.values()), tuple(other.values())
+    if isinstance(one, tuple):
+        assert len(one) == len(other)
+        for mine, theirs in zip(one, other, strict=True):
+            same(mine, theirs)
+    elif np.asarray(one).dtype.kind == "f":
+        np.testing.assert_allclose(one, other, atol=0.02)
+    else:
+        np.testing.assert_array_equal(one, other)
 
 
 def test_the_ego_is_driven_and_reaches_what_it_hits(store):

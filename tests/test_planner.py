@@ -127,10 +127,12 @@ def test_planners_are_forked_with_their_branches(settings: dict[str, Any]) -> No
     if settings["search"] == "tree":
         parents = found.search.parents[..., :-1, :]
         assert (parents != torch.arange(parents.shape[-1])).any(), "nobody was forked"
-    for meant, both in zip(found.meant, found.rollouts.state[..., :2].numpy(), strict=True):
+    for (meant,), both in zip(
+        np.moveaxis(found.meant, 2, 1), found.rollouts.state[..., :2].numpy(), strict=True
+    ):
         state, other = both[:, :, 0], both[:, :-1, 1]
         assert settings["search"] != "none" or (state[0] != state[1]).any()
-        assert meant.shape == (*state[:, 1:].shape[:2], 20, 2)
+        assert meant.shape == (len(state), state.shape[1] - 1, 20, 2)
         said = np.isfinite(meant[:, :, 0]).all(-1)
         assert (said == (np.arange(said.shape[1]) % 3 != 2)).all()
         np.testing.assert_allclose(meant[:, :, 0][said], state[:, 1:][said], atol=1e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shutil
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 
 from helpers_agents import small
 from helpers_segments import crossing, hide, make_road, make_segment, straight_road
@@ -25,8 +27,8 @@ from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.planners import paired_difference, planner_record, planners_text, run_score, winners
 from symphony.learning.demonstrations import SceneDataset
-from symphony.planners.interface import Control, Pose, Scenario, Traffic, checked_plan
-from symphony.planners.view import FunctionPlanner, Observation
+from symphony.planners.interface import Control, Pose, Scenario, Traffic, checked_plan, scenario_of
+from symphony.planners.view import FunctionPlanner, Observation, lanes_of
 from symphony.rollouts.crowd import crowd_dataset
 from symphony.saved.folder import RolloutFolder, load_rollouts
 from symphony.saved.saving import save_simulation
@@ -236,8 +238,44 @@ def test_the_observation_is_all_in_si_units(store: Path, tmp_path: Path) -> None
         assert set(agents.type) == {"vehicle"}
         assert len(one.lanes) == len(segment.road.lanes)
         assert not any(lane.points.flags.writeable for lane in one.lanes)
-        assert {n for lane in one.lanes for n in lane.successors} <= {lane.id for lane in one.lanes}
         assert one.route.ndim == 2
+        # The last 2 s are as they were seen then.
+        before = {other.step: other for other in seen if other.segment_id == one.segment_id}
+        assert len(one.history) == min(t, 10)
+        for step, past in enumerate(one.history, start=max(t - 10, 0)):
+            np.testing.assert_allclose(
+                [past.time, *past.ego], [before[step].time, *before[step].ego], atol=1e-4
+            )
+            for mine, other in zip(past.agents, before[step].agents, strict=True):
+                np.testing.assert_array_equal(mine, other)
+
+
+def test_bounds_and_neighbours_of_lanes() -> None:
+    """Bounds lie half a width beside the centre line, by shapely, on its two sides; links are those of the map."""
+    segment = crossing(4, steps=11)
+    road = segment.road
+    for lost in (False, True):
+        width = (
+            np.where(np.arange(len(road.lanes)) == 0, np.nan, road.lane_width) if lost else road.lane_width
+        )
+        known = segment.replace(road=dataclasses.replace(road, lane_width=width.astype(np.float32)))
+        lanes = lanes_of(scenario_of(known, 0, np.zeros((0, 2)), np.zeros(4), 0))
+        assert np.isnan(lanes[0].left).all() == np.isnan(lanes[0].right).all() == lost
+        for k, lane in enumerate(lanes[lost:], start=int(lost)):
+            middle = shapely.LineString(lane.points)
+            for bound in (lane.left, lane.right):
+                away = shapely.distance(middle, shapely.points(bound))
+                np.testing.assert_allclose(away, lane.width / 2, rtol=2e-2)
+            np.testing.assert_allclose((lane.left + lane.right) / 2, lane.points, atol=1e-9)
+            ring = shapely.LinearRing([*lane.right, *lane.left[::-1]])
+            assert ring.is_ccw
+            for name, pairs in (
+                ("successors", road.successors),
+                ("predecessors", road.successors[:, ::-1]),
+                ("left_neighbors", road.left_neighbors),
+                ("right_neighbors", road.right_neighbors),
+            ):
+                assert set(getattr(lane, name)) == set(road.lane_id[pairs[pairs[:, 0] == k, 1]].tolist())
 
 
 FINE = dict.fromkeys(
@@ -352,12 +390,12 @@ def test_two_planners_each_see_the_scene_from_their_own_seat(search: Any, tmp_pa
         def reset(self, scenario: Scenario) -> None:
             self.rng, self.me, self.at = np.random.default_rng(scenario.seed), scenario.ego, scenario.state
 
-        def plan(self, seen: Traffic) -> Pose:
+        def plan(self, seen: Traffic) -> list[Pose]:
             assert (seen.ego, np.abs(seen.state - self.at).max() < 1e-3) == (self.me, True), "another's"
             assert sorted(np.abs(seen.position[list(ends)] - self.at[:2]).max(1) > 1) == [False, True]
             self.at = self.at + np.array([2.0 + self.rng.random(), 0.0, 0.0, 0.0])
             ends[self.me].append(self.at[0])
-            return Pose(*self.at)
+            return [Pose(*self.at), Pose(*self.at)]
 
     segment, ends = straight_road(4, steps=11), {0: list[float](), 2: list[float]()}
     drives = {int(segment.agent_id[2]): Wanders}
@@ -365,6 +403,8 @@ def test_two_planners_each_see_the_scene_from_their_own_seat(search: Any, tmp_pa
     assert saved.failed == {}
     for place, row in enumerate(ends):
         assert np.abs(np.subtract.outer(saved.state[:, 1:, place, 0], ends[row])).min(-1).max() < 1e-3
+    assert saved.plan is not None
+    np.testing.assert_allclose(saved.plan[:, :, :, 1], saved.state[:, 1:, :2, :2].swapaxes(1, 2), atol=1e-3)
     steps = np.concatenate([np.diff(ends[row]) for row in ends])
     assert len(np.unique(steps.round(6))) == len(steps), "planners draw alike"
 

@@ -64,7 +64,8 @@ def test_reading_is_the_inverse_of_writing(segment, rollouts, seed, searched, da
         routes=Polylines.of([rng.normal(size=(k, 2)).astype("f4") for k in (3, 5)]),
         drivers=tuple(f"driver {row}" for row in rows), failed={0: "no plan\nfound"},
         trees=random_trees(saved, seed=seed) if searched else None,
-        plan=rng.choice([np.nan, 1.5], (rollouts, saved.steps, 3, 2)).astype("f4") if seed % 2 else None,
+        plan=rng.choice([np.nan, 1.5], (rollouts, len(rows), saved.steps, 3, 2)).astype("f4")
+        if seed % 2 else None,
     )  # fmt: skip
     arrays, facts = tensors_of(saved)
     again = read_tensors(save(arrays, {KEY: json.dumps(facts)}), Path("x"), segment.segment_id)
@@ -154,6 +155,7 @@ def put(value):
     ("log.position", put(np.inf), "not finite"), ("road.successors", lambda a: a[:, :1], r"expected int32 \[\d+, 2"),
     ("routes.offsets", lambda a: np.array([0, 2**63 - 1, -2, a[-1]], a.dtype), "offsets"),
     ("plan", put(np.inf), "not finite"), ("plan", put(1e6), "plausible"), ("plan", lambda a: a[:1], "is expected"),
+        ("plan", lambda a: np.repeat(a, 3, 1), "3 planners for 2 agents"),
     ("tree.score", put(np.inf), "infinite"), ("tree.state", put(np.nan), "not finite"),
     ("tree.parents", put(9), "outside"), ("tree.slots", lambda a: a[..., :1], "not 2 rollouts"),
     ("prune_every", 3, "periods"), ("prune_every", 0, "periods"), ("dt", 0.0, "plausible"),
@@ -161,7 +163,7 @@ def put(value):
 def test_what_breaks_the_format_is_named(field, change, message):
     saved = played(crossing(3, steps=9), (0, 1), 2)
     trees = dataclasses.replace(random_trees(saved), there=np.ones((1, 4, 8, 2), bool))
-    plan = np.zeros((2, saved.steps, 1, 2), "f4")
+    plan = np.zeros((2, 1, saved.steps, 1, 2), "f4")
     arrays, facts = tensors_of(dataclasses.replace(saved, trees=trees, plan=plan))
     if field in facts:
         facts[field] = change

@@ -57,8 +57,8 @@ def pages() -> list[SavedRollouts]:
     tracks = hide(crossing(5, steps=21), 3, slice(4, 9))
     turned = tracks.replace(heading=tracks.heading + np.float32(4 * np.pi))
     saved = played(turned, [0, 2], 3, failed={2: "broke <b>off</b>"})
-    plan = np.random.default_rng(0).normal(0, 30, (3, saved.steps, 4, 2)).astype("f4")
-    plan[1, 3:, 2:], plan[2] = np.nan, np.nan
+    plan = np.random.default_rng(0).normal(0, 30, (3, 2, saved.steps, 4, 2)).astype("f4")
+    plan[1, :, 3:, 2:], plan[2] = np.nan, np.nan
     saved = dataclasses.replace(saved, trees=random_trees(saved, branches=5), plan=plan)
     lost = random_segment("odd name", seed=3, agents=4, steps=6, lights=2, marks=3)
     return [saved, played(straight_road(2, steps=16)), played(lost, [1])]
@@ -324,10 +324,10 @@ def test_a_link_follows_the_ego_and_the_legend_says_what_is_what(tmp_path: Path)
 
 @pytest.mark.slow
 def test_planners_play_side_by_side_and_rollouts_are_chosen_by_events(tmp_path: Path) -> None:
-    hits, calm = crash(), played(straight_road(2, steps=31, num_lanes=1), [0], 2, failed={0: "lost"})
+    hits, calm = crash(), played(straight_road(2, steps=31, num_lanes=1), [0, 1], 2, failed={0: "lost"})
     hits.state[1, :10, 0, 3] += 5
-    plan = np.full((2, calm.steps, 3, 2), np.nan, np.float32)
-    plan[1, 4, :2] = [(40, 1), (50, 2)]
+    plan = np.full((2, 2, calm.steps, 3, 2), np.nan, np.float32)
+    plan[1, 0, 4, :2], plan[1, 1, 5, 0] = [(40, 1), (50, 2)], (7, 8)
     calm = dataclasses.replace(calm, plan=plan)
     other, same = (
         played(straight_road(3, steps=11, segment_id="other", num_lanes=1), [0], 1) for _ in range(2)
@@ -358,7 +358,7 @@ def test_planners_play_side_by_side_and_rollouts_are_chosen_by_events(tmp_path: 
       canvas.setPointerCapture = () => 0;  // of a pointer that there is
       for (const kind of ["pointerdown", "pointerup"]) canvas.dispatchEvent(new PointerEvent(kind, where));
       out.clicked = [panes.indexOf(shown), view.agent, $("events").textContent];
-      out.plan = [two.plan(1, 4), two.plan(1, 5), two.plan(0, 4), one.plan(1, 4)];
+      out.plan = [two.plan(1, 4), two.plan(1, 5, 1), two.plan(1, 5), two.plan(0, 4), one.plan(1, 4)];
       out.ttc = Array.from({ length: 12 }, (_, t) => one.collisionIn(1, 0, t)).map(x => Number.isNaN(x) ? null : x);
       out.away = METRICS[3][1](one, 1, 0, 12); out.speed = METRICS[0][1](one, 1, 0, 12);
       const { x, time } = metricsLayout($("metrics"), two);
@@ -379,8 +379,8 @@ def test_planners_play_side_by_side_and_rollouts_are_chosen_by_events(tmp_path: 
     assert out["metrics"]
     assert (*out["clicked"][:2], out["back"], out["legend"]) == (1, 0, 7, "ASIDE")
     assert "none in this rollout" in out["clicked"][2]
-    np.testing.assert_allclose(out["plan"][0], plan[1, 4, :2], atol=0.006)
-    assert out["plan"][1:] == [[], [], []]
+    np.testing.assert_allclose(out["plan"][0], plan[1, 0, 4, :2], atol=0.006)
+    assert out["plan"][1:] == [[[7, 8]], [], [], []]
     report = Report("made", "interactive")
     add_segment(report, hits)
     expected = [None, *(float(x) if x < 10 else None for x in report.collision_in[both[0]][1, :11, 0])]

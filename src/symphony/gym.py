@@ -6,4 +6,4 @@ except ImportError as error:
     raise ImportError("Gymnasium is not installed: pip install 'symphony-traffic[gym]'") from error
 
 if "symphony/Driving-v0" not in gymnasium.registry:
-    gymnasium.register("symphony/Driving-v0", entry_point="symphony.envs.gym:DrivingGym")
+    gymnasium.register("symphony/Driving-v0", entry_point="symphony.planners.gym:DrivingGym")

@@ -26,15 +26,16 @@ from symphony.errors import ConfigError
 from symphony.planners.calls import SECONDS, answer, plans_of
 from symphony.planners.included import IDMPlanner
 from symphony.planners.interface import (
+    HISTORY,
+    Moments,
     Planner,
     Planners,
-    Reals,
     Traffic,
     checked_plan,
-    fixed,
     planner_maker,
     planner_name,
     scenario_of,
+    traffic_of,
 )
 from symphony.streams import Stream, fold_in
 
@@ -151,10 +152,15 @@ class EgoPolicy(TensorDictModuleBase):
         each = (one.failures(part) for one, part in zip(self.drivers, number.unbind(-1), strict=True))
         return [min(filter(None, found), default=None) for found in zip(*each, strict=True)]
 
-    def meant(self, number: Int[Tensor, "*b P"], steps: int) -> NDArray[np.float32] | None:
-        """The trajectories [*b, T, H, 2] that planners of the ego gave back, NaN for none; None without any."""
-        first = self.drivers[0]
-        return first.meant(number[..., 0], steps) if isinstance(first, _Asked) else None
+    def meant(self, number: Int[Tensor, "K P"], steps: int) -> NDArray[np.float32] | None:
+        """The trajectories [K, P, T, H, 2] that planners gave back, NaN for none; None without any."""
+        asked = [(k, one) for k, one in enumerate(self.drivers) if isinstance(one, _Asked)]
+        given = {k: plan for k, one in asked if (plan := one.meant(number[:, k], steps)) is not None}
+        most = max((plan.shape[2] for plan in given.values()), default=0)
+        found = np.full((*number.shape, steps, most, 2), np.nan, np.float32)
+        for k, plan in given.items():
+            found[:, k, :, : plan.shape[2]] = plan
+        return found if given else None
 
 
 class _Driver:
@@ -219,6 +225,7 @@ class _Asked(_Driver):
         self._last = env.scenes.last_step.cpu().numpy()
         self._held: dict[int, Planner | Failure] = {}
         self._meant: dict[int, dict[int, NDArray[np.float32]]] = {}
+        self._past: dict[int, Moments] = {}
         scene = start.get(keys.SCENE).flatten().tolist()
         state = start.get(keys.STATE)[..., place, :].reshape(-1, 4).cpu().numpy()
         own = fold_in(fold_in(start.get(keys.STREAM), Stream.PLANNERS), seed)
@@ -234,7 +241,7 @@ class _Asked(_Driver):
             error = error or answer(planner.reset, made, seconds=egos.seconds)
             failed = isinstance(error, Exception)
             self._held[number] = self._failure(row, 0, "reset", error) if failed else planner
-            self._meant[number] = {}
+            self._meant[number], self._past[number] = {}, ()
         self._next = len(scene)
         drives = next((held for held in self._held.values() if not isinstance(held, Failure)), None)
         if forked and drives is not None:
@@ -274,7 +281,11 @@ class _Asked(_Driver):
             planner = self._held[numbers[m]]
             if going[m] and not isinstance(planner, Failure):
                 ahead = route_from(self._routes[row], come[m])
-                seen = self._traffic(row, steps[m], own[m].numpy(), moves[m], present[m], ahead)
+                past = self._past[numbers[m]]
+                now = moves[m], present[m]
+                at = self.egos.segments[row], self.rows[row], steps[m], own[m].numpy()
+                seen = traffic_of(*at, now, past, ahead)
+                self._past[numbers[m]] = (*past, now)[-round(HISTORY / self.env.dt) :]
                 asked.append((m, planner, seen))
         plans = plans_of([one[1] for one in asked], [one[2] for one in asked], self.egos.seconds)
         # One that is over, or has failed, keeps its speed.
@@ -315,6 +326,7 @@ class _Asked(_Driver):
         """Numbers of planners that may be changed, one for each rollout that goes on."""
         self._held = {n: self._held[n] for n in set(numbers)}
         self._meant = {n: self._meant[n] for n in set(numbers)}
+        self._past = {n: self._past[n] for n in set(numbers)}
         taken: set[int] = set()
         out = []
         for number, goes in zip(numbers, going, strict=True):
@@ -323,6 +335,7 @@ class _Asked(_Driver):
                 if number in taken:
                     chosen, self._next = self._next, self._next + 1
                     self._held[chosen], self._meant[chosen] = self._copy(planner), {**self._meant[number]}
+                    self._past[chosen] = self._past[number]
                 taken.add(chosen)
             out.append(chosen)
         return out
@@ -336,27 +349,8 @@ class _Asked(_Driver):
                 "branches: simulate with --search none"
             ) from error
 
-    def _traffic(self, row: int, step: int, own: Reals, moves: Reals, there: Any, route: Reals) -> Traffic:
-        segment = self.egos.segments[row]
-        there = there[: segment.num_agents]
-        moves = np.where(there[:, None], moves[: segment.num_agents], 0.0)
-        return Traffic(
-            step=step,
-            time=step * self.env.dt,
-            ego=self.rows[row],
-            state=fixed(own),
-            position=fixed(moves[:, :2]),
-            heading=fixed(moves[:, 2]),
-            velocity=fixed(moves[:, 3:]),
-            size=fixed(segment.size[:, :2].astype(np.float64)),
-            agent_type=fixed(segment.agent_type),
-            valid=fixed(there),
-            lights=fixed(segment.signal_state[:, step]),
-            route=fixed(route),
-        )
 
-
-def route_from(route: NDArray[np.float32], progress: float) -> NDArray[np.float64]:
+def route_from(route: NDArray[Any], progress: float) -> NDArray[np.float64]:
     """Points [K, 2] of a route from so many metres along on, at least 200 m of it or all there is."""
     if not len(route):
         return route.astype(np.float64)

@@ -23,6 +23,9 @@ from symphony.errors import ConfigError
 from symphony.imports import load_object
 
 Reals = NDArray[np.float64]
+Moment = tuple[Reals, NDArray[np.bool_]]
+"""Everyone at one step: x, y, heading and velocity [A, 5], and who is there [A]."""
+Moments = tuple[Moment, ...]
 Named = str | Callable[..., Any]
 """A planner by its name, or what makes it."""
 Planners = Mapping[int | None, Named]
@@ -34,6 +37,7 @@ MAX_STEERING = 0.6
 """Radians of its front wheels either way."""
 MAX_SPEED = 80.0
 """m/s that a pose may ask for, and by which it may lie away from where the vehicle is."""
+HISTORY = 2.0  # seconds before each step that planners are told
 MAX_HEADING = 1e4
 """Radians either way that a pose may have."""
 FARTHEST = 1e5  # metres from the origin that a trajectory may come to, as saved rollouts may
@@ -77,6 +81,9 @@ class Traffic:
         lights: [Q] :class:`symphony.data.segment.SignalState` of each light of the scenario.
         route: [K, 2] points to follow from where the ego has come to, 3 m apart: 200 m of the scenario's route, or
             what there is of it up to the end of the map.
+        past: [H, A, 5] x, y, heading and velocity of everyone at the steps before, the oldest first: of the last
+            :data:`HISTORY` seconds, or as many as there were since the start; 0 where not valid.
+        past_valid: [H, A] who was there.
     """
 
     step: int
@@ -91,6 +98,8 @@ class Traffic:
     valid: NDArray[np.bool_]
     lights: NDArray[np.uint8]
     route: Reals
+    past: Reals
+    past_valid: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,6 +289,31 @@ def scenario_of(
         log=fixed(np.concatenate([position, heading[:, None], speed[:, None]], -1)),
         log_valid=fixed(valid),
         seed=seed,
+    )
+
+
+def traffic_of(
+    segment: RunSegment, ego: int, step: int, state: Reals, now: Moment, past: Moments, route: Reals
+) -> Traffic:
+    """What is seen from an agent's seat: its state [4], everyone now and before, and the route ahead [K, 2]."""
+    agents, (moves, there) = segment.num_agents, now
+    before = [np.where(here[:, None], each, 0.0)[:agents] for each, here in past]
+    moves, there = np.where(there[:, None], moves, 0.0)[:agents], there[:agents]
+    return Traffic(
+        step=step,
+        time=step * float(segment.dt),
+        ego=ego,
+        state=fixed(state),
+        position=fixed(moves[:, :2]),
+        heading=fixed(moves[:, 2]),
+        velocity=fixed(moves[:, 3:]),
+        size=fixed(segment.size[:, :2].astype(np.float64)),
+        agent_type=fixed(segment.agent_type),
+        valid=fixed(there),
+        lights=fixed(segment.signal_state[:, step]),
+        route=fixed(route),
+        past=fixed(np.array(before).reshape(-1, agents, 5)),
+        past_valid=fixed(np.array([here[:agents] for _, here in past], bool).reshape(-1, agents)),
     )
 
 

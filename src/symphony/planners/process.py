@@ -11,11 +11,10 @@ error is shown.
 Of the environment it gets ``PATH``, ``HOME``, ``LANG``, names that begin with ``PYTHON``, and those that
 ``SYMPHONY_PLANNER_ENV`` names, separated by commas.
 
-SCENE has ``segment_id``, ``dt``, ``steps``, ``seed``, ``ego``, ``goal`` [2], ``route`` [[x, y], ...], ``lanes`` (each
-with ``id``, ``points``, ``speed_limit`` or null, ``successors``) and ``lights`` (``x``, ``y``, ``lane``). NOW has
-``time``, ``step``, ``ego`` (``x``, ``y``, ``heading``, ``speed``, ``length``, ``width``), ``agents`` (lists ``x``,
-``y``, ``heading``, ``vx``, ``vy``, ``length``, ``width``, ``type``, ``id``), ``route`` (what lies ahead) and
-``lights`` (their states). Units and words are those of :class:`symphony.planners.view.Observation`.
+SCENE has ``segment_id``, ``dt``, ``steps``, ``seed``, ``ego``, ``goal`` [2], ``route`` [[x, y], ...], ``lanes``,
+``crosswalks`` and ``lights`` (``x``, ``y``, ``lane``). NOW has ``time``, ``step``, ``ego``, ``agents``, ``history``,
+``route`` (what lies ahead) and ``lights`` (their states). Units and words are those of
+:class:`symphony.planners.view.Observation`; what is not known is null.
 """
 
 from __future__ import annotations
@@ -29,11 +28,12 @@ import signal
 import subprocess
 import time
 import weakref
-from math import isnan
 from typing import Any
 
+import numpy as np
+
 from symphony.planners.interface import Scenario, Traffic
-from symphony.planners.view import Ego, lanes_of, observation_of
+from symphony.planners.view import Ego, crosswalks_of, lanes_of, observation_of
 
 LONGEST = 1 << 20
 """Bytes of an answer."""
@@ -71,12 +71,8 @@ class ProcessPlanner:
             "ego": Ego(*scenario.state.tolist(), *scenario.size.tolist())._asdict(),
             "goal": scenario.goal.tolist(),
             "route": scenario.route.tolist(),
-            "lanes": [
-                lane._asdict()
-                | {"points": lane.points.tolist()}
-                | ({"speed_limit": None} if isnan(lane.speed_limit) else {})
-                for lane in lanes_of(scenario)
-            ],
+            "lanes": [_plain(lane) for lane in lanes_of(scenario)],
+            "crosswalks": _plain(crosswalks_of(scenario)),
             "lights": {"x": x, "y": y, "lane": scenario.road.lane_id[scenario.signal_lane].tolist()},
         }
         given = self._ask("reset", told)
@@ -86,12 +82,13 @@ class ProcessPlanner:
 
     def plan(self, traffic: Traffic) -> Any:
         """The plan that the process answers."""
-        seen = observation_of(self.scenario, traffic, ())
+        seen = observation_of(self.scenario, traffic)
         now = {
             "time": seen.time,
             "step": seen.step,
-            "ego": seen.ego._asdict(),
-            "agents": {name: value.tolist() for name, value in seen.agents._asdict().items()},
+            "ego": _plain(seen.ego),
+            "agents": _plain(seen.agents),
+            "history": [_plain(one) for one in seen.history],
             "route": seen.route.tolist(),
             "lights": seen.lights.state.tolist(),
         }
@@ -140,6 +137,16 @@ class ProcessPlanner:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ProcessPlanner:
         raise TypeError("a process can't be copied")
+
+
+def _plain(value: Any) -> Any:
+    """A record, an array or a number as JSON has it: null where it is not known."""
+    if hasattr(value, "_asdict"):
+        return {name: _plain(part) for name, part in value._asdict().items()}
+    if isinstance(value, tuple):
+        return [_plain(part) for part in value]
+    array = np.asarray(value)
+    return None if array.dtype.kind == "f" and np.isnan(array).any() else array.tolist()
 
 
 def environment() -> dict[str, str]:

@@ -54,7 +54,7 @@ class Simulation(NamedTuple):
         steps: that were simulated for them, each of a rollout or branch.
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
         drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
-        meant: per scene, trajectories [K, T, H, 2] that its planners gave back; None for none.
+        meant: per scene, trajectories [K, P, T, H, 2] that its planners gave back; None for none.
     """
 
     rollouts: Rollouts

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.data.segment import AgentType, LaneType, RunSegment, SignalState
+from symphony.planners.view import normals
 from symphony.saved.rollouts import PLAYBACK, SavedRollouts, World, world_of
 
 Reals = NDArray[np.float64]
@@ -153,7 +154,7 @@ class _Network:
         width, kind = float(self.road.lane_width[k]), LaneType(self.road.lane_type[k])
         if not np.isfinite(width):
             width = BIKE_WIDTH if kind == LaneType.BIKE_LANE else NOMINAL_WIDTH
-        aside = 0.5 * width * _normals(self.lines[k])
+        aside = 0.5 * width * normals(self.lines[k])
         for tag, bound in (("leftBound", self.lines[k] + aside), ("rightBound", self.lines[k] - aside)):
             side = _add(node, tag)
             for place in bound:
@@ -186,18 +187,6 @@ class _Network:
         _point(node, "position", self.segment.signal_point[light, :2] + self.segment.origin[:2])
         _add(node, "direction", turn)
         _add(node, "active", "true")
-
-
-def _normals(line: Reals) -> Reals:
-    """[P, 2] to the left at each point, as long as keeps the bounds at their distance at corners (at most 1.5)."""
-    along = np.diff(line, axis=0)
-    along /= np.linalg.norm(along, axis=-1, keepdims=True)
-    left = np.stack([-along[:, 1], along[:, 0]], -1)
-    before, after = np.concatenate([left[:1], left]), np.concatenate([left, left[-1:]])
-    middle = before + after
-    length = np.linalg.norm(middle, axis=-1, keepdims=True)
-    middle = np.where(length > 1e-6, middle / np.maximum(length, 1e-6), before)
-    return middle * np.minimum(2 / np.maximum(length, 1e-6), 1.5)
 
 
 def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:

@@ -362,7 +362,9 @@ def _check(saved: SavedRollouts, segment_id: str) -> None:
     ]
     states = {"state": saved.state[saved.there]} if all(good for _, good, _ in demanded) else {}
     if saved.plan is not None:
-        _check_shape("plan", saved.plan, "fKTH2", size | {"2": 2})
+        _check_shape("plan", saved.plan, "fKPTH2", {name: size[name] for name in "KT"} | {"2": 2})
+        few = saved.plan.shape[1] <= size["N"]
+        demanded += [("plan", few, f"{saved.plan.shape[1]} planners for {size['N']} agents")]
         states["plan"] = saved.plan[~np.isnan(saved.plan).any(-1)]
     if trees is not None:
         for name, shape in _TREE_SHAPES.items():

@@ -71,7 +71,8 @@ class SavedRollouts:
         drivers: [N] who drove each agent.
         failed: reason why a rollout broke off, by its number; its later steps don't count.
         trees: the searches, where they are kept.
-        plan: [K, T, H, 2] points that the ego's planner meant to come past, NaN for none; None if it never said.
+        plan: [K, P, T, H, 2] points that the planners of the first P agents meant to come past, NaN for none; None if
+            none ever said.
     """
 
     segment: RunSegment
@@ -180,7 +181,7 @@ def saved_rollouts(
 ) -> SavedRollouts:
     """The rollouts [B, K, ...] of one run segment, in a row of B scenes, ready to be written; with the goals
     [B, K, N], the search [B, R] of which they are the leaves, the driver of all interactive agents, or of each, who
-    drives the background agents (``others``), why rollouts failed, by number, and the ego's ``plan`` [K, T, H, 2].
+    drives the background agents (``others``), why rollouts failed, by number, and what planners meant (``plan``).
     """
     real, background = (_array(part[row]) for part in (scenes.interactive_valid, scenes.background))
     steps = min(segment.num_steps - 1, rollouts.collision.shape[-2])
@@ -191,7 +192,7 @@ def saved_rollouts(
     agents, state = _array(scenes.interactive[row])[real], _array(rollouts.state[row])[:, : steps + 1, real]
     about: dict[str, Any] = {"drivers": tuple(np.array(names, object)[real]), "failed": dict(failed or {})}
     about["trees"] = None if search is None else _trees(search, row, steps, real)
-    about["plan"] = None if plan is None else plan[:, :steps]
+    about["plan"] = None if plan is None else plan[:, :, :steps]
     return SavedRollouts(segment, agents, state, counted, collision, offroad, line[:, real], routes, **about)
 
 

@@ -78,9 +78,10 @@ class Replay {
     const seconds = this.ttc[(k * this.agents.length + this.rank.get(row)) * this.steps + t - 1];
     return seconds > 10.1 ? NaN : seconds;
   }
-  // What the planner of the ego meant to come past, said at state t, as [x, y].
-  plan(k, t) {
-    const at = k * this.steps + t, count = this["plan.count"] && t < this.steps ? this["plan.count"][at] : 0;
+  // What the planner of driven agent n meant to come past, said at state t, as [x, y].
+  plan(k, t, n = 0) {
+    const counts = this["plan.count"] || [], planners = counts.length / (this.rollouts * this.steps);
+    const at = (k * planners + n) * this.steps + t, count = n < planners && t < this.steps ? counts[at] : 0;
     const most = count && this["plan.x"].length / this["plan.count"].length;
     return Array.from({ length: count }, (_, h) => [this["plan.x"][at * most + h], this["plan.y"][at * most + h]]);
   }

@@ -30,7 +30,7 @@ class Scene {
     for (let row = 0; row < r.size.length / 2; row++) {
       if (!r.rank.has(row)) this.box(context, row, r.logged(row, view.t), DARK[r.type[row]] || PLAYBACK, 1);
     }
-    if (plan) this.plan(context, view);
+    if (plan) r.agents.forEach((_, n) => this.plan(context, view, n));
     r.agents.forEach((row, n) => this.box(context, row, r.simulated(view.rollout, n, view.t), this.colors[n], 1));
     if (view.branch) this.branch(context, view);
     this.selection(context, view);
@@ -108,11 +108,11 @@ class Scene {
     }
   }
 
-  // What the ego's planner meant to do when it was last asked.
-  plan(context, view) {
-    const r = this.replay, t = Math.min(Math.floor(view.t), r.steps - 1), points = r.plan(view.rollout, t), ego = r.state(view.rollout, r.ego, t);
-    if (!points.length || !ego) return;
-    context.beginPath(); context.moveTo(ego.x, ego.y);
+  // What a planner meant to do when it was last asked.
+  plan(context, view, n) {
+    const r = this.replay, t = Math.min(Math.floor(view.t), r.steps - 1), points = r.plan(view.rollout, t, n), own = r.simulated(view.rollout, n, t);
+    if (!points.length || !own) return;
+    context.beginPath(); context.moveTo(own.x, own.y);
     for (const [x, y] of points) context.lineTo(x, y);
     for (const [color, width] of [["white", 4.5], [PLAN, 2]]) { context.strokeStyle = color; context.lineWidth = width * this.px; context.stroke(); }
     context.fillStyle = PLAN;

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import gymnasium
 import numpy as np
+import shapely
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -22,6 +23,9 @@ from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
 from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
+from symphony.planners.driver import route_from
+from symphony.planners.interface import HISTORY, Moment, Reals, Scenario, scenario_of, traffic_of
+from symphony.planners.view import Lane, Observation, crosswalks_of, lanes_of, observation_of
 from symphony.roadgraph import LaneGraph
 
 BOUND = 1000.0  # what observations are clipped to; they are scaled to numbers near one
@@ -36,7 +40,8 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
     Observations are what :class:`symphony.envs.driving.DrivingEnv` shows an agent, in its own frame: ``own``,
     ``objects`` and ``points`` with their masks, ``route`` where asked for (the one the log took). The rest is in
     ``info``: ``segment`` (its id), ``step``, ``state`` (x, y in metres, heading in radians, speed in m/s),
-    ``collision``, ``offroad``, and ``driven``, metres since the step before.
+    ``collision``, ``offroad``, and ``driven``, metres since the step before. What a planner would be told is
+    :meth:`seen`.
 
     Args:
         data: a store of run segments, or its folder.
@@ -56,7 +61,10 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         ConfigError: an unknown kind of action, or a negative duration.
     """
 
+    env: DrivingEnv
     _now: TensorDictBase
+    _before: list[TensorDictBase]
+    _told: tuple[Scenario, tuple[Lane, ...], tuple[Reals, ...]] | None
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own
 
     def __init__(
@@ -130,11 +138,36 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
                 raise ConfigError(f"an action is two finite numbers, not {action}")
             chosen = torch.as_tensor(numbers.clip(-1.0, 1.0) * (TOP_SPEED * self.env.dt))[None]
         before = self._now.get(keys.STATE)[0, :2]
+        self._before = [*self._before, self._now][-round(HISTORY / self.env.dt) :]
         after = self.env.step(self._now.set(keys.ACTION, chosen)).get("next")
         reward, ended, cut = (after.get(key).item() for key in (keys.REWARD, "terminated", "truncated"))
         self._now = after.exclude(keys.REWARD)
         driven = float((self._now.get(keys.STATE)[0, :2] - before).norm())
         return self._observed(), reward, ended, cut, self._info(driven)
+
+    def seen(self) -> Observation:
+        """What a planner that is a function would observe now; its seed is 0."""
+        ego, state = self.segment.ego, self._now.get(keys.STATE)[0].double().numpy()
+        if self._told is None:
+            graph, route = LaneGraph(self.segment.road), np.zeros((0, 2), np.float32)
+            made = scene(self.segment, [ego], graph)
+            if (which := int(made.route_logged[0, 0])) >= 0:
+                route = made.whole_route(0, 0, which).numpy()
+            first = self._before[0] if self._before else self._now
+            told = scenario_of(self.segment, ego, route, first.get(keys.STATE)[0].numpy(), 0)
+            self._told = told, lanes_of(told), crosswalks_of(told)
+        told, lanes, crosswalks = self._told
+        far = shapely.LineString(told.route).project(shapely.Point(state[:2])) if len(told.route) else 0.0
+        now, past = self._moment(self._now), tuple(map(self._moment, self._before))
+        at = self.segment, ego, int(self._now.get(keys.STEP)), state
+        return observation_of(
+            told, traffic_of(*at, now, past, route_from(told.route, far)), lanes, crosswalks
+        )
+
+    def _moment(self, now: TensorDictBase) -> Moment:
+        row, step = now.get(keys.SCENE).flatten(), now.get(keys.STEP).flatten()
+        everyone = self.env.objects(row, step, now.get(keys.STATE)[None], now.get(keys.VALID)[None])
+        return everyone.state[0].double().numpy(), everyone.valid[0].numpy()
 
     def _usable(self, number: int) -> bool:
         segment = self.store[number]
@@ -149,7 +182,8 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
             segment = segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})
         graph = LaneGraph(segment.road) if self.observation.route else None
         made = scene(segment, [segment.ego], graph, number=number)
-        self.segment_id, ends = segment.segment_id, self.ends_on
+        self.segment, self.segment_id, ends = segment, segment.segment_id, self.ends_on
+        self._before, self._told = [], None
         self.env = DrivingEnv(made, self.dynamics, self.observation, reward=self.reward, ends_on=ends)
         self._now = self.env.start(torch.tensor(0), goal=made.route_logged[0] if graph else None)
 
