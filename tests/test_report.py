@@ -109,10 +109,8 @@ def test_progress_is_along_the_route_and_relative_to_the_log(lines: list[Any]) -
     saved.state[2, :, 0, :2] = 0
     saved.state[3, :, 0, :2] = saved.state[0, :, 0, 1::-1]  # across the route, which is no progress along it
     ways = dataclasses.replace(saved, routes=routes, goal=np.full((4, 1), len(routes) - 1))
-    found = rows(ways)
-    assert [row["progress"] for row in found[: 3 + len(lines)]] == pytest.approx(
-        [20, 10, 0, 0][: 3 + len(lines)], abs=1e-4
-    )
+    found, known = rows(ways), 3 + len(lines)
+    assert [row["progress"] for row in found[:known]] == pytest.approx([20, 10, 0, 0][:known], abs=1e-4)
     assert [row["progress_ratio"] for row in found[:3]] == pytest.approx([1, 0.5, 0], abs=1e-5)
     assert found[1]["log_distance"] == pytest.approx(0.5 * 2 * np.arange(1, 11).mean(), rel=1e-5)
     # Who drives as the log does gets on as far, also where the log has lost it for a part of the time.
@@ -260,11 +258,8 @@ def test_the_command_writes_page_numbers_and_table(tmp_path, capsys):
     assert not re.search("src=|http", page)
     assert (sim / "view.html").is_file()
     assert main(["report", str(sim), "--no-view", "--out", str(tmp_path / "other")]) == 0
-    assert sorted(p.name for p in (tmp_path / "other").iterdir()) == [
-        "report.csv",
-        "report.html",
-        "report.json",
-    ]
+    written = sorted(path.name for path in (tmp_path / "other").iterdir())
+    assert written == ["report.csv", "report.html", "report.json"]
     assert main(["report", str(tmp_path / "nothing")]) == 1
     assert "no folder of rollouts" in capsys.readouterr().err
 
@@ -326,9 +321,8 @@ def test_divergences_must_differ_by_more_than_sampling(shift: float, held: bool)
     rng, entries = np.random.default_rng(0), [entry("bc"), entry("bc_ts")]
     for one, mean in zip(entries, (0.0, shift), strict=True):
         noise = rng.normal(0, 0.001, 40)
-        one.record["curvature"]["parts"] = {
-            f"g{k}": part for k, part in enumerate(mean + noise - noise.mean())
-        }
+        values = mean + noise - noise.mean()
+        one.record["curvature"]["parts"] = {f"g{k}": part for k, part in enumerate(values)}
     found = of(relations(entries), "curvature_jsd", "bc", "bc_ts")
     assert (found["held"], found["value"]) == (held, pytest.approx(shift))
     assert found["se"] == pytest.approx(0.001 * np.sqrt(2 / 40), rel=0.4)

@@ -169,7 +169,9 @@ def crowd_dataset(
     in_open, onward = config.open_traffic or everyone or rule, None
     if isinstance(config, SimulateConfig):
         in_open = in_open or config.after_collision in ("remove", "respawn")
-        onward = Onward(config.inflow, config.lights, config.seed) if config.duration and in_open else None
+        # Those that nobody would drive don't enter.
+        inflow = config.inflow if rule or agent.policy is not None else 0.0
+        onward = Onward(inflow, config.lights, config.seed) if config.duration and in_open else None
     crowd = Crowd(count, everyone, config.radius, in_open, rule, config.others == "idm", tuple(also), onward)
     seconds, keep = config.duration or agent.duration, config.batch or TOGETHER
     routes = agent.routed or routes

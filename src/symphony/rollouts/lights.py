@@ -19,10 +19,8 @@ from symphony.roadgraph.graph import turn_between
 States = NDArray[np.uint8]
 Rows = NDArray[np.intp]
 
-USUAL = (25.0, 3.0, 2.0)
-"""Seconds of green, amber and all red of a phase."""
-JUNCTION = 30.0
-"""Metres between stop points, from one to the next, within which lights are of one junction."""
+USUAL = (25.0, 3.0, 2.0)  # seconds of green, amber and all red of a phase
+JUNCTION = 30.0  # metres between stop points, from one to the next, within which lights are of one junction
 GREEN = (SignalState.GO, SignalState.ARROW_GO)
 AMBER = (SignalState.CAUTION, SignalState.ARROW_CAUTION)
 ARROW = (SignalState.ARROW_STOP, SignalState.ARROW_CAUTION, SignalState.ARROW_GO)
@@ -127,11 +125,9 @@ def _planned(
     ends = np.array([amber - _since(row[None], np.ones(1, bool)) * dt for row in ambers])
     slows |= (ambers[:, -1] & ~now)[:, None] & (np.arange(steps) * dt < ends[:, None] - 1e-6)
     arrow = np.isin(state, ARROW).any(1, keepdims=True)
-    kinds = [
-        np.where(arrow, *pair)
-        for pair in zip(ARROW[::-1], (*GREEN[:1], *AMBER[:1], SignalState.STOP), strict=True)
-    ]
-    return np.where(goes, kinds[0], np.where(slows, kinds[1], kinds[2])).astype(np.uint8)
+    shown = np.where(goes, SignalState.GO, np.where(slows, SignalState.CAUTION, SignalState.STOP))
+    # Arrows are numbered like plain ones.
+    return (shown - np.where(arrow, SignalState.STOP - SignalState.ARROW_STOP, 0)).astype(np.uint8)
 
 
 def _since(flags: NDArray[np.bool_], who: NDArray[np.bool_]) -> int:

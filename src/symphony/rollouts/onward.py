@@ -28,12 +28,9 @@ Indices = NDArray[np.int64]
 
 NEAR, TURN = 50.0, math.pi / 3
 """Metres from where an entrance lane begins, and largest angle to it, within which a vehicle came in by it."""
-PRIOR = 10.0
-"""Seconds of the log for which the mean rate of all entrances of a map counts at each of them."""
-USUAL = 8.0
-"""Speed in m/s of who enters where the log has nobody who drives, if the lane has no lower limit."""
-MOST_ENTER = 512
-"""Vehicles that enter a run segment past its log, at most."""
+PRIOR = 10.0  # seconds of the log for which the mean rate of all entrances of a map counts at each of them
+USUAL = 8.0  # speed in m/s of who enters where nobody drives in the log, if the lane has no lower limit
+MOST_ENTER = 512  # vehicles that enter a run segment past its log, at most
 
 
 @dataclass(frozen=True)
@@ -169,8 +166,7 @@ def _came_in(segment: RunSegment, graph: LaneGraph, lanes: Indices) -> tuple[Ind
 
 def _pace(log: RunSegment, graph: LaneGraph, lane: int, came: Indices, number: float) -> float:
     """A speed for a vehicle that enters: of one of those that came in by its lane, then, or of one that drives."""
-    seen = np.linalg.norm(log.velocity, axis=-1)
-    first = log.valid.argmax(1)
+    seen, first = np.linalg.norm(log.velocity, axis=-1), log.valid.argmax(1)
     speeds = seen[came, first[came]]
     if not (speeds := speeds[speeds > STANDING]).size:
         speeds = seen[log.valid & (log.agent_type == AgentType.VEHICLE)[:, None] & (seen > STANDING)]

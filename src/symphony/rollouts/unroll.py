@@ -77,7 +77,8 @@ def draw_goals(
     """The route [..., N] that the goal policy draws for each agent from a start state, -1 for none; ``tree`` is the
     number of the draw within its scene.
 
-    In open traffic, agents that enter later draw as if all of them were there already.
+    In open traffic, agents that enter later draw as if all of them were there already; past the log, where nobody
+    knows who will be, as if nobody else were.
     """
     noise = _drawn(env, start.get(keys.SCENE), seed, Stream.GOALS, tree)
 
@@ -90,8 +91,13 @@ def draw_goals(
     found, waiting = drawn(start), start.get(keys.WAITING, None)
     if waiting is None:
         return found
-    everyone = env.at(start.copy().set(keys.VALID, start.get(keys.VALID) | waiting))
-    return torch.where(waiting, drawn(everyone), found)
+    late = (env.scenes.enter > env.scenes.log_end[:, None])[start.get(keys.SCENE).squeeze(-1)]
+    for which in (waiting & ~late, late)[: 1 + env.past_log]:
+        there = env.at(start.copy().set(keys.VALID, start.get(keys.VALID) | which))
+        if which is late and keys.OBJECTS_MASK in there.keys(True):
+            there.set(keys.OBJECTS_MASK, torch.zeros_like(there.get(keys.OBJECTS_MASK)))
+        found = torch.where(which, drawn(there), found)
+    return found
 
 
 class RouteGoals(Transform):
