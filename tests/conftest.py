@@ -19,8 +19,11 @@ from helpers_processes import serve_from_here
 from helpers_skips import LIMITS, by_kind, grown
 from symphony import parallel as engine
 
+# Looking for garbage is a twentieth of all work otherwise, and there is next to none while tests are imported.
+gc.disable()
+
 # A busy machine must not fail a test; other examples are tried each time.
-settings.register_profile("symphony", deadline=None, max_examples=30)
+settings.register_profile("symphony", deadline=None, max_examples=20)
 settings.load_profile("symphony")
 
 # Two torch threads on shared cores spin against each other otherwise; must precede the first torch import.
@@ -36,9 +39,10 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 
 
 def pytest_collection_finish() -> None:
-    """Nothing that was imported or collected is garbage: not to look at it again and again saves a twentieth."""
-    gc.collect()
+    """Nothing that was imported or collected is garbage: it is not to be looked at again and again."""
     gc.freeze()
+    gc.set_threshold(20_000, 10, 10)
+    gc.enable()
     serve_from_here()
 
 

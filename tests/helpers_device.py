@@ -70,12 +70,12 @@ class _Watch(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         out = func(*args, **(kwargs or {}))
-        given = _tensors(args) + _tensors(tuple((kwargs or {}).values()))
-        before, after = ({v.device.type for v in each} for each in (given, _tensors(out)))
-        if len(before | after) > 1 and before:
-            shapes = [tuple(v.shape) for v in given]
-            # A single number of the host may take part in anything: it travels with the call.
-            if "copy" in str(func):
+        # A single number of the host may take part in anything: it travels with the call.
+        if "copy" in func.__name__:
+            given = _tensors(args) + _tensors(tuple((kwargs or {}).values()))
+            before, after = ({v.device.type for v in each} for each in (given, _tensors(out)))
+            if len(before | after) > 1 and before:
+                shapes = [tuple(v.shape) for v in given]
                 self.pretended.waits.append(f"{func} {sorted(before)} -> {sorted(after)} {shapes}")
         return out
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
-from helpers_segments import random_segment
+from helpers_segments import beginning, random_segment
+from symphony.data.builtin import builtin_store
 from symphony.data.segment import RunSegment, content_hash
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
@@ -15,6 +18,12 @@ def fill(path: Path, found: list[RunSegment], *, append: bool = False) -> Segmen
         for segment in found:
             writer.append(segment)
     return SegmentStore(path)
+
+
+def brief(path: Path, rows: Iterable[int], steps: int = 26, split: Any = "test") -> Path:
+    """A store of the first steps of built-in run segments, five seconds of each."""
+    found = SegmentStore(builtin_store(split))
+    return fill(path, [beginning(found[row], steps) for row in rows]).path
 
 
 def hashes(found: SegmentStore | list[RunSegment]) -> list[str]:

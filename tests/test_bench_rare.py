@@ -16,6 +16,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from helpers_segments import straight_road
+from helpers_store import brief
 from symphony import keys
 from symphony.bench.rare import Rate, leaf_weights, remarks, resampling
 from symphony.cli import main
@@ -65,6 +66,11 @@ def known_rate() -> float:
     return float(share[TOP])
 
 
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return brief(tmp_path_factory.mktemp("data") / "store", (0, 19, 3))
+
+
 @pytest.mark.parametrize("rule", [resampling(), Systematic()], ids=["seldom", "always"])
 def test_the_rate_of_a_chain_is_found_without_bias_by_few_branches(rule: Systematic) -> None:
     """To the exact rate, with an error far below that of as many free rollouts."""
@@ -107,9 +113,9 @@ def test_near_is_whoever_is_ahead_and_a_hit_is_remembered() -> None:
     assert near(300.0, 0.0, hit=1.0) == 1
 
 
-def test_the_command_finds_the_rate_of_free_rollouts_and_keeps_what_shows_it(tmp_path, capsys):
+def test_the_command_finds_the_rate_of_free_rollouts_and_keeps_what_shows_it(store, tmp_path, capsys):
     coast, agent, out = EXAMPLES / "coast.py", "pretrained:bc_ts_h", tmp_path / "out"
-    words = f"{agent} --planner {coast}:plan --data {builtin_store('test')} --segments 19".split()
+    words = f"{agent} --planner {coast}:plan --data {store} --segments 1".split()
     kept = f"--metric collision_rate --trees 6 --branches 8 --out {out} --json -".split()
     assert main(["hunt", *words, *kept]) == 0
     segment, mean = json.loads(capsys.readouterr().out)
@@ -149,10 +155,10 @@ def test_what_a_rate_is_worth_is_said():
     assert said(math.nan, 0) == ""
 
 
-def test_a_hunt_says_no_zero_for_what_it_does_not_know(tmp_path, capsys):
+def test_a_hunt_says_no_zero_for_what_it_does_not_know(store, tmp_path, capsys):
     plan = "def plan(s):\n    if '001000-f0-w09' in s.segment_id: raise ValueError('flat tyre')\n    return 0, 0\n"
     (tmp_path / "fails.py").write_text(plan)
-    words = f"hunt pretrained:bc_ts_h --data {builtin_store('test')} --trees 4 --branches 2 --out x".split()
+    words = f"hunt pretrained:bc_ts_h --data {store} --trees 4 --branches 2 --out x".split()
 
     def told(planner, segment, out, *more):
         words[-1] = str(tmp_path / out)
@@ -167,7 +173,7 @@ def test_a_hunt_says_no_zero_for_what_it_does_not_know(tmp_path, capsys):
     assert [one["rate"] for one in found] == [pytest.approx(1.0, abs=0.5)] * 2
     # Where it fails in one segment, the others have their rates; the same hunt finds the same once more.
     for _ in range(2):
-        code, text, error = told(fails, "0 19", "one", "--metric", "collision_rate", "--json", "-")
+        code, text, error = told(fails, "0 1", "one", "--metric", "collision_rate", "--json", "-")
         lost, other, mean = json.loads(text)
         assert (code, lost["rate"], mean["rate"]) == (0, None, other["rate"])
         assert lost["failed"] in error
@@ -178,5 +184,5 @@ def test_a_hunt_says_no_zero_for_what_it_does_not_know(tmp_path, capsys):
     zero = json.loads(told("log", "0", "zero", "--json", "-")[1])[-1]
     assert (zero["rate"], zero["error"]) == (0.0, None)
     assert re.search(
-        r"mean of 0 +– +– +0 of 0 +0\n", told("log", "3", "dark", "--metric", "red_light_rate")[1]
+        r"mean of 0 +– +– +0 of 0 +0\n", told("log", "2", "dark", "--metric", "red_light_rate")[1]
     )

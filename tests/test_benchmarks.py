@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from helpers_segments import crossing, straight_road
-from helpers_store import fill
+from helpers_store import brief, fill
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import save_checkpoint
 from symphony.agents.choice import FOLDER as PRETRAINED
@@ -91,9 +91,12 @@ def test_dense_counts_the_operations_of_every_element(program: Any) -> None:
     torch.testing.assert_close(found["auto"][2], found["dense"][2])
 
 
-def test_a_step_and_an_update_start_no_more_operators_than_they_did(program: Any) -> None:
+def test_a_step_and_an_update_start_no_more_operators_than_they_did(
+    program: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
     """Each is a launch on a device. Whoever needs more raises the bound, and says why."""
-    launches = program("launches")
+    launches, store = program("launches"), brief(tmp_path / "store", range(2), 21, "train")
+    monkeypatch.setattr(launches, "builtin_store", lambda split: store)
     step = launches.of_a_search_step()
     assert step["environment"] <= 830
     assert step.total() - step["environment"] <= 200
@@ -103,10 +106,10 @@ def test_a_step_and_an_update_start_no_more_operators_than_they_did(program: Any
 
 def test_reinforcement_learning_is_recorded(program: Any, tmp_path: Path, monkeypatch: Any) -> None:
     learning = program("reinforcement")
-    store = fill(tmp_path / "store", [straight_road(4), crossing(4)]).path
+    store = fill(tmp_path / "store", [straight_road(4, steps=14), crossing(4, steps=14)]).path
     monkeypatch.setattr(learning, "builtin_store", lambda split: store)
     monkeypatch.setattr(learning, "SHOWN", (0,))
-    runs = {method: [learning.run(method, seed, batches=2) for seed in (0, 1)] for method in learning.METHODS}
+    runs = {method: [learning.run(method, seed, batches=1) for seed in (0, 1)] for method in learning.METHODS}
     for one, other in runs.values():
         assert all(
             0 < m < 2560 * 8 and 0 <= crashes <= 256 for m, crashes in (*one["batches"], one["unseen"])

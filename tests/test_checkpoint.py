@@ -351,7 +351,7 @@ def test_weights_that_are_not_finite_are_refused(value, tmp_path):
 
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
-    fill(tmp_path / "store", [crossing(seed=k, steps=8) for k in range(3)])
+    fill(tmp_path / "store", [crossing(seed=k, steps=5) for k in range(3)])
     return tmp_path / "store"
 
 
@@ -376,7 +376,7 @@ def test_equal_runs_write_equal_checkpoints(store, tmp_path):
         random.seed(seed)
         np.random.seed(seed)  # noqa: NPY002
         torch.manual_seed(seed)
-        train(tiny("bc_ts", store, tmp_path / name, seed=5))
+        train(tiny("bc_ts_h", store, tmp_path / name, seed=5))
     kept = [(tmp_path / name / "checkpoints").glob("*/*") for name in "ab"]
     one, other = ({(file.parent.name, file.name): file.read_bytes() for file in files} for files in kept)
     assert len(one) > 6

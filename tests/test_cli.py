@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import re
@@ -18,7 +19,7 @@ import tyro
 
 import symphony.data.convert
 from helpers_cli import commands, words
-from helpers_processes import apart
+from helpers_processes import apart, forget, output_of
 from helpers_saved import played
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
@@ -289,23 +290,22 @@ def test_plot_refuses_what_it_cannot_draw(store: Path, change: str, tmp_path: Pa
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
 
-LOOKS = """
-import contextlib, io, sys
-from symphony.cli import main
-for command in sys.argv[1:]:
-    with contextlib.redirect_stdout(io.StringIO()):
-        assert main(command.split()) == 0
-    assert not {"torchrl", "tensordict", "torch._dynamo"} & set(sys.modules), command
-"""
+def look(folder: Path, commands: tuple[str, ...]) -> None:
+    """Run commands there, none of which may import what only learning needs."""
+    forget("symphony", "torchrl", "tensordict")
+    sys.modules.pop("torch._dynamo", None)
+    os.chdir(folder)
+    command_line = importlib.import_module("symphony.cli")
+    for command in commands:
+        assert command_line.main(command.split()) == 0
+        assert not {"torchrl", "tensordict", "torch._dynamo"} & set(sys.modules), command
 
 
 def test_looking_at_results_imports_no_torchrl(tmp_path: Path) -> None:
     save_rollouts(tmp_path / "sim", About("made"), [played(straight_road(2, steps=6))])
     (tmp_path / "metrics.jsonl").write_text('{"step": 1, "loss": 2.0}\n')
     looks = ("agents", "plot curves . --out a.png", "view sim", "view sim --out b.png", "report sim")
-    command = [sys.executable, "-c", LOOKS, *looks]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    output_of(look, tmp_path, looks, said=tmp_path / "said")
 
 
 def test_tables_are_aligned_and_never_break_a_name(capsys: pytest.CaptureFixture[str]) -> None:

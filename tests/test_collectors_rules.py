@@ -85,7 +85,7 @@ def filtered(y: Tensor, rule: Any, branches: int, **how: Any) -> collectors.Beam
 def test_the_evidence_is_that_of_kalmans_filter(scheme, threshold):
     torch.manual_seed(0)
     y, evidence, mean = observed(40)
-    y, evidence, mean = (part.repeat_interleave(25, 0) for part in (y, evidence, mean))
+    y, evidence, mean = (part.repeat_interleave(10, 0) for part in (y, evidence, mean))
     found = filtered(y, scheme(threshold=threshold), 128, prune_last=False)
     assert found.log_evidence is not None
     assert found.leaf_log_weights is not None

@@ -192,7 +192,7 @@ TINY = 4.139035625378231e-209
 BOX = st.tuples(*(st.floats(a, b) for a, b in ((-50, 50), (-50, 50), (0.1, 20), (1, 20), (0, 6.3))))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @example([(0, 0, 1, 1, 0), *[(0, 0, 1, 1, 1)] * 2, (0, 0, 2, 1, TINY), (0, TINY, 3, 1, 0), (2, 0, 1, 1, 2)])
 @given(st.lists(BOX, min_size=1, max_size=6))
 def test_rings_bound_the_union(boxes: list[tuple[float, ...]]) -> None:

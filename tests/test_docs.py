@@ -12,8 +12,8 @@ import os
 import re
 import runpy
 import shlex
-import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,8 @@ import pytest
 
 import lint_length
 import symphony.cli
-from helpers_segments import beginning
-from helpers_store import fill
-from symphony.data.builtin import builtin_store
-from symphony.data.store import SegmentStore
+from helpers_processes import output_of
+from helpers_store import brief
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
@@ -64,17 +62,14 @@ def commands(page: str) -> list[list[str]]:
 
 
 @pytest.fixture(scope="module")
-def brief(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Some of the built-in run segments, the first three seconds of each."""
-    found, out = SegmentStore(builtin_store("test")), tmp_path_factory.mktemp("brief") / "store"
-    fill(out, [beginning(found[k], 16) for k in range(4)])
-    return out
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return brief(tmp_path_factory.mktemp("brief") / "store", range(4), steps=16)
 
 
 @pytest.mark.filterwarnings("ignore::symphony.errors.DataWarning")  # code that an agent names, and is trusted
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")])
-def test_examples_run(page: str, brief: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("symphony.data.builtin.builtin_store", lambda split: brief)
+def test_examples_run(page: str, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("symphony.data.builtin.builtin_store", lambda split: store)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     before, space = set(sys.modules), {"__name__": "example"}
@@ -159,13 +154,20 @@ needs_mkdocs = pytest.mark.skipif(
 )
 
 
+def _built(out: str) -> int:
+    """Build the pages; the package, which a hook looks at, is imported here already."""
+    os.chdir(ROOT)
+    os.environ["NO_MKDOCS_2_WARNING"] = "1"
+    warnings.simplefilter("default")
+    from mkdocs.__main__ import cli
+
+    return cli(["build", "--strict", "--quiet", "--site-dir", out], standalone_mode=False)
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)]
-    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONWARNINGS": "default"}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    output_of(_built, str(out), said=tmp_path_factory.mktemp("said") / "said")
     return out
 
 

@@ -19,7 +19,7 @@ from helpers_pool import Counted, die_at_three, environment, fail_at_three, slow
 from helpers_processes import forget, output_of
 from helpers_runs import tiny
 from helpers_segments import crossing, straight_road
-from helpers_store import fill
+from helpers_store import brief, fill
 from symphony import keys
 from symphony.agents import load_agent
 from symphony.cli import main
@@ -192,9 +192,9 @@ def test_every_cell_of_the_notebook_runs_and_is_kept_without_output(tmp_path, mo
 
 def test_demo(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
     """With fewer updates, rollouts and segments than a newcomer gets, over what an earlier demo has left."""
-    store = SegmentStore(builtin_store("test"))
-    fill(tmp_path / "test", [store[i] for i in range(3)])
-    folders = {"train": builtin_store("train"), "test": tmp_path / "test"}
+    for split in ("train", "test"):
+        brief(tmp_path / split, (3, 9, 15), split=split)
+    folders = {split: tmp_path / split for split in ("train", "test")}
     monkeypatch.setattr("symphony.data.builtin.builtin_store", folders.__getitem__)
     earlier = tmp_path / "demo" / "bc_h"
     earlier.mkdir(parents=True)
@@ -221,7 +221,7 @@ def test_demo(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
 
 def test_the_table_of_all_methods(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
     for split, seed in (("train", 0), ("test", 1)):
-        fill(tmp_path / split, [straight_road(4, seed=seed, steps=6), crossing(4, seed=seed, steps=6)])
+        fill(tmp_path / split, [straight_road(4, seed=seed, steps=4), crossing(4, seed=seed, steps=4)])
     script = runpy.run_path(str(EXAMPLES.parent / "benchmarks" / "make_table.py"))
     monkeypatch.setitem(script["main"].__globals__, "builtin_store", lambda split: tmp_path / split)
     sizes = "--steps 2 --states 8 --agent.hidden 8 --agent.num-points 8 --search.updates 2 "

@@ -98,7 +98,7 @@ def test_the_fit_of_the_built_in_set_ends_near_the_log(split: str) -> None:
     assert errors.mean() < 0.15
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(
     st.lists(st.lists(st.integers(0, 9), min_size=1, max_size=4), max_size=20),
     st.integers(1, 60),

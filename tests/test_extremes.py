@@ -217,7 +217,7 @@ def test_other_time_steps(scenes, dt, tmp_path):
     assert_metrics_finite(agent, tmp_path / "store")
 
 
-LENGTHS = (7, 4, 8)
+LENGTHS = (6, 4, 6)
 """Steps of the segments ``straight-0``, ``crossing-1`` and ``crossing-2``."""
 SEARCHES = (("none", "best"), ("best", "best"), ("tree", "systematic"), ("backtrack", "best"))
 

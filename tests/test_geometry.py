@@ -49,7 +49,7 @@ def test_corner_order():
     assert shapely.LinearRing(corners.numpy()).is_ccw
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(box, box)
 @example((0.0, 0.0, 0.0, 4.0, 2.0), (4.0, 1.0, math.pi / 2, 2.0, 4.0))  # they touch
 @example(
@@ -70,7 +70,7 @@ def test_agrees_with_shapely(first, second):
         assert geometry.boxes_overlap(*args) or depth < 1e-8
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(box, box, angle, coordinate, coordinate)
 def test_invariant_under_rigid_motion_and_swap(first, second, turn, dx, dy):
     args = tensors(first, second)
@@ -127,7 +127,7 @@ poses = st.tuples(coordinate, coordinate, st.floats(-4, 4))
 sizes = st.tuples(st.floats(0.4, 6), st.floats(0.4, 3))
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(poses, poses, poses, poses, st.tuples(sizes, sizes), st.floats(0, 0.4))
 def test_a_contact_is_where_many_small_steps_find_one(a, b, c, d, size, turn):
     ways = torch.tensor([[a, (*b[:2], a[2] + turn)], [c, (*d[:2], c[2] - turn)]], dtype=torch.float64)
@@ -236,7 +236,7 @@ def closed(ring):
     return np.concatenate([ring, ring[:1]])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(3, 30), st.integers(0, 4))
 def test_polygons_with_holes_agree_with_shapely(seed, corners, holes):
     rng = np.random.default_rng(seed)

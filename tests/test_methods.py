@@ -48,7 +48,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     late = hide(crossing(5, seed=1, steps=6), 3, slice(0, 4))
     fill(
         path := tmp_path_factory.mktemp("data") / "store",
-        [straight_road(4, steps=8), crossing(4, steps=9), late],
+        [straight_road(4, steps=5), crossing(4, steps=7), late],
     )
     return path
 
@@ -103,8 +103,8 @@ def test_each_method_trains_its_networks_and_tells_of_them(trained, store, tmp_p
 
 
 def test_the_seed_decides_the_weights(trained: Trained, store: Path, tmp_path: Path) -> None:
+    """That the same seed gives the same ones is a matter of checkpoints, and tested with them."""
     first = weights(trained("bc_ts_h"))
-    assert same_weights(weights(train(tiny("bc_ts_h", store, tmp_path / "again"))), first)
     other = weights(train(tiny("bc_ts_h", store, tmp_path / "other", seed=1)))
     assert not any(same_weights(of(n, other), of(n, first)) for n in ("policy", "goals", "discriminator"))
 

@@ -195,7 +195,7 @@ def test_standard_errors_match_the_bootstrap() -> None:
     metrics = scored(random_inputs(5, batch=150))
     numbers, rng = metrics.compute(), np.random.default_rng(0)
     segments, draws = list(metrics.segments.values()), []
-    for _ in range(80):
+    for _ in range(40):
         again = RolloutMetrics()
         for k, i in enumerate(rng.integers(0, 150, 150)):
             again.segments[str(k)] = dataclasses.replace(segments[i], group=str(k))
@@ -255,7 +255,7 @@ def test_histogram_bins() -> None:
     assert {k - 100: n for k, n in enumerate(counts) if n} == {-100: 2, -1: 1, 0: 3, 1: 1, 99: 1, 100: 2}
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1))
 def test_divergence_agrees_with_scipy(seed: int, share: float) -> None:
     distance = pytest.importorskip("scipy.spatial.distance")

@@ -87,22 +87,23 @@ def moved(before: dict[str, list[Tensor]], after: dict[str, list[Tensor]]) -> se
 
 @pytest.mark.parametrize(("method", "cells"), [*((method, 0) for method in METHODS), ("mgail", 5)])
 def test_each_phase_changes_the_networks_it_is_for(store, tmp_path, method, cells):
-    settings = config(method, store, tmp_path, mgail=replace(SHORT, expert_weight=0.0))
-    trainer = build(replace(settings, agent=replace(settings.agent, cells=cells)))
+    settings = config(method, store, tmp_path, mgail=replace(SHORT, head_start=1, expert_weight=0.0))
+    settings = replace(settings, steps=4, agent=replace(settings.agent, cells=cells))
+    trainer = build(settings)
     goals, rates = {"goals"} if method.endswith("_h") else set(), []
-    phases = [{"policy"}] * 2 + [{"discriminator"}] * 2 + [{"policy", "discriminator"}] * 2
+    phases = [{"policy"}] * 2 + [{"discriminator"}] + [{"policy", "discriminator"}]
     for step, phase in enumerate(phases):
         before = copies(trainer)
         record = trainer._update(step)
         assert moved(before, copies(trainer)) == phase | goals
         assert {name.removeprefix("loss_") for name in record if name.startswith("loss_")} == phase | goals
         assert ("loss_discriminator" in record) == ("search_auc_collision" in record) == (step >= 2)
-        assert ("policy_mgail_score" in record) == (step >= 4)
+        assert ("policy_mgail_score" in record) == (step >= 3)
         assert all(not value.requires_grad for value in record.values())
         assert all(math.isfinite(v) for k, v in record.items() if k.startswith(("loss", "gradient")))
         rates.append(trainer.optimizers["policy"].param_groups[0]["lr"])
     # The policy's rate starts anew with the second phase, at one of its own.
-    assert rates[0] == trainer.config.learning_rate > rates[1] > rates[2] == SHORT.learning_rate > rates[5]
+    assert rates[0] == trainer.config.learning_rate > rates[1] > rates[2] == SHORT.learning_rate > rates[3]
     # Goals and discriminator learn nothing from the loss of the policy.
     used = pieces(trainer)
     for module in trainer.agent.modules.values():
@@ -156,9 +157,10 @@ def test_regression_beside_it_and_more_updates_of_the_discriminator(store, tmp_p
 
 
 def test_a_run_that_ends_before_its_adversarial_updates_says_so(store, tmp_path, capsys):
-    train(config("mgail", store, tmp_path / "short", steps=4))
-    assert "warning: the run ends at update 4, before the first of adversarial" in capsys.readouterr().err
-    train(config("mgail", store, tmp_path / "long", steps=5))
+    early = MGAILConfig(regression=1, head_start=1, rollouts=2)
+    train(config("mgail", store, tmp_path / "short", steps=2, mgail=early))
+    assert "warning: the run ends at update 2, before the first of adversarial" in capsys.readouterr().err
+    train(config("mgail", store, tmp_path / "long", steps=3, mgail=early))
     assert "warning" not in capsys.readouterr().err
 
 

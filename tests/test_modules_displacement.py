@@ -109,7 +109,7 @@ def make(pace=2.0, slope=0.1, loc=(0.0, 0.0), scale=(1.0, 1.0), dtype=torch.floa
 
 def given_bounds(law):
     paces, slopes, inner = st.floats(0, 8), st.floats(0.005, 0.3), st.floats(-0.99 * INNER, 0.99 * INNER)
-    return settings(max_examples=40)(given(paces, slopes, inner, inner)(law))
+    return settings(max_examples=25)(given(paces, slopes, inner, inner)(law))
 
 
 def policy(seed=0, **kwargs):
@@ -123,7 +123,7 @@ def test_latent_numbers_come_back(pace, slope, first, second):
     torch.testing.assert_close(dist.latent(dist.displacement(u)), u, rtol=1e-6, atol=1e-6)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(st.floats(0, 8), st.floats(0.005, 0.3), st.floats(-30, 30), st.floats(-30, 30))
 def test_whatever_was_logged_has_a_likelihood(pace, slope, forward, left):
     """Also reversing, sliding sideways and jumps: that of the nearest displacement that is possible."""
@@ -188,7 +188,7 @@ def test_draws_are_those_of_the_gaussian(how):
 numbers = st.floats(-1e6, 1e6, width=32)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(speed=st.floats(0, 40), length=st.floats(1.0, 15.0), first=numbers, second=numbers)
 def test_every_draw_can_be_driven(speed, length, first, second):
     """Bounds on speed, acceleration and lateral acceleration hold for any output of the network."""
@@ -265,7 +265,7 @@ def test_the_density_integrates_to_one_and_is_that_of_the_draws(pace):
 shares_inside = st.floats(2**-24, 1 - 2**-24)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     st.lists(st.floats(-80, 80), min_size=F * L, max_size=F * L),
     shares_inside,

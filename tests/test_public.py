@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import subprocess
 import sys
 from pathlib import Path
 
 import symphony
+from helpers_processes import forget, output_of
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
 
@@ -18,14 +18,6 @@ NOT_NEEDED = (
     "cli collectors envs.driving evaluation metrics render planners.interface rollouts.unroll rollouts.search"
 )
 ROOMS = "agents config envs modules learning objectives roadgraph rollouts training wosac"
-TRAIN = """
-import sys
-from pathlib import Path
-from symphony import TrainConfig, train
-data, out = map(Path, sys.argv[1:])
-train(TrainConfig(method="bc", data=data, out=out, steps=1, states=8, segments=2, wandb="disabled"))
-print(*sys.modules, sep="\\n")
-"""
 
 
 def test_public_names_are_there_and_documented() -> None:
@@ -45,11 +37,19 @@ def test_names_of_packages_are_theirs() -> None:
             assert not inspect.ismodule(getattr(package, name)), f"{package.__name__}.{name}"
 
 
+def cloned(data: Path, out: Path) -> None:
+    """Clone, and tell what that has imported."""
+    forget("symphony", "matplotlib", "wandb")
+    clone = importlib.import_module("symphony")
+    how = {"steps": 1, "states": 8, "segments": 2, "wandb": "disabled"}
+    clone.train(clone.TrainConfig(method="bc", data=data, out=out, **how))
+    sys.stdout.write("\n".join(["modules:", *sys.modules]))
+
+
 def test_cloning_loads_nothing_that_it_does_not_use(tmp_path: Path) -> None:
     fill(tmp_path / "data", [straight_road(3, steps=8), crossing(4, steps=8)])
-    command = [sys.executable, "-c", TRAIN, str(tmp_path / "data"), str(tmp_path / "run")]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    reached = set(done.stdout.split())
+    said = output_of(cloned, tmp_path / "data", tmp_path / "run", said=tmp_path / "said")
+    reached = set(said.partition("modules:")[2].split())
     assert "symphony.recipes.bc" in reached
     unused = {"matplotlib.pyplot", "wandb", *(f"symphony.{name}" for name in NOT_NEEDED.split())}
     assert not unused & reached

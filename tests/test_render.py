@@ -477,7 +477,7 @@ def test_missing_and_odd_values_are_tolerated(tmp_path: Path) -> None:
     assert plot_curves({"odd": odd}, tmp_path / "odd.svg").axes[0].lines[1].get_marker() == "o"
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=25)
 @given(
     arrays(np.float64, st.integers(1, 40), elements=st.floats(-1e3, 1e3) | st.just(math.nan)), st.floats(0, 1)
 )

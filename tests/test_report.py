@@ -56,7 +56,7 @@ def driving(*ways: tuple[float, float, float, float], steps: int = 21, **changes
     return make_segment(make_road(lines, boundary=boundary), position, heading, velocity, DT, **changes)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     st.tuples(*[st.floats(-8, 8)] * 2, st.floats(-3, 3), st.floats(1, 12)),
     st.tuples(st.floats(5, 25), st.floats(-15, 15), st.floats(-3, 3), st.floats(0, 12)),

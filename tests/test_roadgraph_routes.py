@@ -234,7 +234,7 @@ def own_sharpest(graph, lanes):
 
 
 @given(st.integers(0, 9), st.floats(0.0, 0.95), st.floats(0.0, 40.0))
-@settings(max_examples=40)
+@settings(max_examples=25)
 def test_routes_can_be_driven(which, share, speed):
     road, entries = maps()[which // 2]
     graph = LaneGraph(road)

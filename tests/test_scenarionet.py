@@ -257,7 +257,7 @@ def same(found: Any, expected: Any) -> bool:
     return type(found) is type(expected) and found == expected
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(TREES, st.sampled_from(PROTOCOLS))
 def test_plain_data_comes_back(tmp_path_factory: pytest.TempPathFactory, tree: Any, protocol: int) -> None:
     assert same(load(pickle.dumps(tree, protocol), tmp_path_factory.getbasetemp()), tree)

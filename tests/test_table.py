@@ -15,7 +15,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers_runs import tiny
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
 from helpers_table import full_table, make_entry, make_record, make_run, row_of
@@ -37,7 +36,6 @@ from symphony.evaluation.table import (
 )
 from symphony.files import json_text
 from symphony.metrics import jensen_shannon
-from symphony.recipes import train
 from symphony.render import plot_curvature
 
 NUMBERS = st.floats(0, 100)
@@ -192,13 +190,15 @@ def test_the_text_reads_back(seeds: int, dataset: Any) -> None:
 
 def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(tmp_path, monkeypatch, capsys):
     store = tmp_path / "test"
-    fill(store, [straight_road(4, seed=1, steps=8), crossing(4, seed=1, steps=8)])
+    fill(store, [straight_road(4, seed=1, steps=5), crossing(4, seed=1, steps=5)])
     (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path / "empty")
-    run = train(tiny("bc", store, tmp_path / "bc", steps=2))
-    file = tmp_path / "numbers.json"
+    run, file, drawn = (tmp_path / name for name in ("bc", "numbers.json", "rollouts.png"))
+    small = "--agent.hidden 8 --agent.num-points 12 --states 16 --wandb disabled"
+    assert main(f"train bc --data {store} --out {run} --steps 2 --seed 4 {small}".split()) == 0
     command = ["evaluate", str(run), "--data", str(store), "--rollouts", "2"]
-    assert main([*command, "--no-keep", "--json", str(file)]) == 0
+    assert main([*command, "--no-keep", "--json", str(file), "--figure", str(drawn)]) == 0
+    assert drawn.stat().st_size > 10_000
     assert not (run / "evaluations").exists()
     for _ in range(2):
         assert main(command) == 0

@@ -24,7 +24,6 @@ from helpers_segments import crossing, straight_road
 from helpers_store import fill
 from symphony.agents import build_agent, load_agent, observation_of
 from symphony.agents.checkpoint import checkpoints
-from symphony.cli import main
 from symphony.cli import recipe as recipes
 from symphony.config import METHODS, AgentConfig, AgentSpec, Method, TrainConfig, read_json, to_json
 from symphony.config.files import from_dict
@@ -109,11 +108,11 @@ def test_a_recipe_of_ones_own_may_leave_the_policy_as_it_is(store: Path, tmp_pat
 
 
 def test_training_lowers_the_loss(store: Path, tmp_path: Path) -> None:
-    how = {"steps": 100, "states": 128, "learning_rate": 3e-3, "checkpoint_every": 100}
+    how = {"steps": 60, "states": 128, "learning_rate": 1e-2, "checkpoint_every": 60}
     out = train(config(store, tmp_path / "long", **how))
     losses, rates = ([r[name] for r in read_metrics(out)] for name in ("loss_policy", "learning_rate"))
-    assert rates[0] == 3e-3
-    assert rates[-1] == pytest.approx(3e-4, rel=0.05)
+    assert rates[0] == 1e-2
+    assert rates[-1] == pytest.approx(1e-3, rel=0.05)
     assert losses[0] == pytest.approx(math.log(147), rel=0.1)
     assert sum(losses[-5:]) < 0.85 * sum(losses[:5])
 
@@ -139,21 +138,6 @@ def test_flags_of_the_environment_are_those_of_the_metrics(store: Path) -> None:
     off = signed_distance(places.flatten(1, -2), *edges).reshape(places.shape[:-1]) > 0
     assert torch.equal(off, done.offroad)
     assert 0 < off.float().mean() < 1
-
-
-def test_command_line_trains_and_evaluates(store, tmp_path, capsys):
-    out, file, picture = tmp_path / "run", tmp_path / "numbers.json", tmp_path / "rollouts.png"
-    small = "--agent.hidden 8 --agent.num-points 20 --wandb disabled"
-    assert main(f"train bc --data {store} --out {out} --steps 3 --seed 4 {small}".split()) == 0
-    assert main(f"evaluate {out} --data {store} --json {file} --figure {picture} --rollouts 2".split()) == 0
-    numbers = json.loads(file.read_text())
-    assert {"collision_rate", "offroad_time", "curvature_jsd", "seed"} <= numbers.keys()
-    assert numbers["playback"]["ade"] == 0
-    assert len(numbers["per_segment"]) == numbers["segments"] == 6
-    printed = capsys.readouterr().out
-    assert f"{numbers['ade']:.2f}" in printed
-    assert f"{numbers['min_sade']:.2f}" in printed
-    assert picture.stat().st_size > 10_000
 
 
 def test_a_store_that_teaches_nothing_is_found_before_training(tmp_path: Path) -> None:
@@ -270,7 +254,7 @@ def run_script(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Pat
 @pytest.mark.parametrize("method", RECIPES)
 def test_recipe(run_script: Any, tmp_path: Path, method: str, capsys: pytest.CaptureFixture[str]) -> None:
     for split, seed in (("train", 0), ("test", 1)):
-        fill(tmp_path / split, [straight_road(4, seed=seed, steps=8), crossing(4, seed=seed, steps=8)])
+        fill(tmp_path / split, [straight_road(4, seed=seed, steps=5), crossing(4, seed=seed, steps=5)])
     words = f"--data train --test test --out run {ARGUMENTS[method]}"
     assert run_script(SCRIPTS / f"{method}.py", words) == 0
     (file,) = (tmp_path / "run" / "evaluations").iterdir()

@@ -30,14 +30,14 @@ from symphony.training.logging import read_metrics
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "train"
-    fill(path, [straight_road(4, seed=0, steps=8), crossing(4, seed=0, steps=7)])
+    fill(path, [straight_road(4, seed=0, steps=6), crossing(4, seed=0, steps=5)])
     return path
 
 
 @pytest.fixture(scope="module")
 def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "held_out"
-    fill(path, [crossing(6, seed=10 + seed, steps=8) for seed in range(4)])
+    fill(path, [crossing(6, seed=10 + seed, steps=5) for seed in range(4)])
     return path
 
 
@@ -66,12 +66,6 @@ def test_every_checkpoint_and_the_last_weights_are_evaluated_as_the_evaluator_do
         assert found.search == "tree"
         numbers = found.numbers()
         assert {f"validation_{name}": numbers[name] for name in METRICS}.items() <= record.items()
-
-
-@pytest.mark.parametrize("method", ["bc", "bc_ts"])
-def test_being_watched_changes_nothing(store: Path, held_out: Path, tmp_path: Path, method: str) -> None:
-    runs = [train(config(store, tmp_path / str(k), data, method)) for k, data in enumerate((None, held_out))]
-    assert same_weights(*(weights(f"{run}@last") for run in runs))
 
 
 Scripted = Callable[..., None]
@@ -144,7 +138,7 @@ def test_what_is_evaluated_stays_the_same_when_a_run_goes_on(store, held_out, tm
     train(replace(short, resume=True, steps=4, validation=replace(short.validation, data=moved)))
     # Nor can scores on other segments be compared, whether or not it was evaluated in between.
     others = tmp_path / "others"
-    fill(others, [crossing(6, seed=20 + seed, steps=8) for seed in range(4)])
+    fill(others, [crossing(6, seed=20 + seed, steps=5) for seed in range(4)])
     for between in (False, True):
         if between:
             train(replace(short, resume=True, steps=6, validation=ValidationConfig(rollouts=2)))

@@ -104,7 +104,7 @@ def test_states_between_decisions_are_those_of_resampling(seed, dt):
 
 @pytest.mark.parametrize("settings", [PLAIN, SEARCH], ids=["none", "tree"])
 def test_nothing_of_the_future_is_used(settings):
-    agent, segment, settings = small(), mixed_segment(), replace(settings, horizon=2.0)
+    agent, segment, settings = small(), mixed_segment(), replace(settings, horizon=1.0)
     later = np.arange(segment.num_steps) > 10
     other = segment.replace(
         position=np.where(later[:, None], segment.position + 7, segment.position),
@@ -168,18 +168,18 @@ def test_who_stands_stays_and_is_in_the_way(seen):
 
 
 def test_goals_of_the_log_are_those_that_were_taken(seen):
-    segment = wosac_window(crossing(num_agents=3))
+    segment = wosac_window(crossing(num_agents=3), 40)
     log = future_log(segment)
     assert np.array_equal(history_only(segment, 0.2).position[:, 0], log.position[:, 0])
     for logged in (False, True):
-        wosac_rollouts(small(), segment, replace(PLAIN, logged_goals=logged))
+        wosac_rollouts(small(), segment, replace(PLAIN, horizon=4.0, logged_goals=logged))
     (sampled, before), (followed, config) = seen
     assert (before.logged_goals, config.logged_goals) == (False, True)
     assert np.array_equal(sampled.route_point, followed.route_point)
     for k in range(3):
         # The logged route passes near every logged position; so did the vehicle.
         route = followed.whole_route(0, k, int(followed.route_logged[0, k])).numpy()
-        away = np.linalg.norm(log.position[k, ::10, None, :2] - route[None], axis=-1).min(1)
+        away = np.linalg.norm(log.position[k, ::5, None, :2] - route[None], axis=-1).min(1)
         assert away.max() < 3
 
 
@@ -437,7 +437,9 @@ def test_a_segment_that_cannot_be_scored_ends_no_others_whatever_the_workers(tmp
             evaluated(items, strict=strict)
 
 
-def test_the_record_has_the_score_and_tables_have_its_columns(tmp_path, capsys):
+def test_the_record_has_the_score_and_tables_have_its_columns(tmp_path, capsys, monkeypatch):
+    usual = WosacSettings.of
+    monkeypatch.setattr(WosacSettings, "of", lambda config: replace(usual(config), horizon=2.0))
     fill(tmp_path / "store", [straight_road(2, seed=k, group=f"recording {k}") for k in range(2)])
     one, two, data = tmp_path / "one.json", tmp_path / "two.json", str(tmp_path / "store")
     how = ("--json", str(one), "--rollouts", "2", "--metrics", "wosac")
