@@ -1,11 +1,12 @@
 """Waymax beside ours, where it is installed: bicycle, collisions and off-road of 32 agents on each of 64 ring roads.
 
-    python benchmarks/waymax_beside.py [--steps 20]
+    python benchmarks/waymax_beside.py [--steps 20] [--device cuda]
 
 The same scenes, with 2 000 road points each; on one core if the machine is told so (``taskset -c 0`` and
-``OMP_NUM_THREADS=1``). Waymax comes from https://github.com/waymo-research/waymax; the ``waymax`` of the package
-index is another. It is made for accelerators, where this was not run. First both take one step of 0.1 s, and must
-find the same positions and overlaps.
+``OMP_NUM_THREADS=1``). With ``--device cuda`` both are on the card (JAX must have been installed for it), and the
+time of a step is that on the wall until the card is done, not that of the CPU. Waymax comes from
+https://github.com/waymo-research/waymax; the ``waymax`` of the package index is another. First both take one step of
+0.1 s, and must find the same positions and overlaps.
 """
 
 from __future__ import annotations
@@ -147,9 +148,20 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--steps", type=int, default=20)
-    steps = parser.parse_args().steps
-    found = {}
-    ours, _ = rings(0, 0)
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    options = parser.parse_args()
+    card, found = options.device == "cuda", {}
+    jax.config.update("jax_platforms", options.device)
+    if card and jax.devices()[0].platform != "gpu":
+        raise SystemExit("JAX has no card here: pip install 'jax[cuda13]'")
+    clock = time.perf_counter if card else time.process_time
+    step, _ = rings(0, 0, device=options.device)
+
+    def ours() -> None:
+        step()
+        if card:
+            torch.cuda.synchronize()
+
     scenes = collate([ring(k) for k in range(SCENES)])
     theirs = waymax_step(scenes)
     agree(scenes, *theirs())
@@ -157,12 +169,14 @@ def main() -> None:
         for _ in range(25):  # compilation there, grids of the maps here
             work()
         seconds = []
-        for _ in range(steps):
-            began = time.process_time()
+        for _ in range(options.steps):
+            began = clock()
             work()
-            seconds.append(time.process_time() - began)
+            seconds.append(clock() - began)
         found[name] = SCENES * AGENTS / float(np.median(seconds))
-        print(f"{name}: {found[name]:,.0f} agent-steps/s of CPU time", flush=True)
+        print(
+            f"{name}: {found[name]:,.0f} agent-steps/s {'on the card' if card else 'of CPU time'}", flush=True
+        )
     print(f"ratio: {found['symphony'] / found['waymax']:.1f}")
 
 

@@ -106,21 +106,24 @@ def step_of(scenes: SceneBatch, config: ObservationConfig, rows: Tensor, *, comp
     if compiled:
         env.compile()
     start = env.start(rows)
-    start.set(keys.ACTION, torch.full((*rows.shape, env.num_agents), env.dynamics.num_actions // 2))
+    straight = env.dynamics.num_actions // 2
+    start.set(keys.ACTION, torch.full((*rows.shape, env.num_agents), straight, device=rows.device))
     # A step writes what comes next into what it is given; in a rollout that is new each time.
     return lambda: env.step(start.copy()), rows.numel() * env.num_agents
 
 
-def rings(objects: int, points: int, *, count: int = SCENES, agents: int = AGENTS) -> Work:
+def rings(
+    objects: int, points: int, *, count: int = SCENES, agents: int = AGENTS, device: str = "cpu"
+) -> Work:
     """All agents of some ring roads."""
-    scenes = collate([ring(seed, agents) for seed in range(count)])
+    scenes = collate([ring(seed, agents) for seed in range(count)]).to(torch.device(device))
     if objects or points:
         config = ObservationConfig(num_objects=objects, num_points=points)
     else:
         nothing = getattr(ObservationConfig, "nothing", None)
         # The least that could be asked for before.
         config = ObservationConfig(1, 1) if nothing is None else nothing()
-    return step_of(scenes, config, torch.arange(count))
+    return step_of(scenes, config, torch.arange(count, device=device))
 
 
 def builtin(count: int, agents: int = 2) -> SceneBatch:

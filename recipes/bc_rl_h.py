@@ -33,14 +33,14 @@ def bc_rl_h(config: TrainConfig, processes: Processes) -> Trainer:
     # Environment and collector: all branches go on, with goals of their own.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=device)
     collector = BeamSearchCollector(
-        with_rows(env, [min(config.segments, len(data))]),
+        with_rows(env, [config.rows(len(data))]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, None, score="flags"),
         rule=KeepAll(),
         prepare=lambda start: with_drawn_goals(env, goals, start, seed, config.search.goals),
-        **collector_settings(config.search, env, seed, data, config.segments, KeepAll()),
+        **collector_settings(config.search, env, seed, data, config.rows(len(data)), KeepAll()),
     )
-    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
+    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states, config.segments)
 
     # Losses and optimizers.
     policy_loss = processes.wrap_ddp(DistillationLoss(policy))

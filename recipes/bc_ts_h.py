@@ -37,14 +37,14 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
     # Environment and collector: the discriminator prunes branches whose routes the goal policy draws.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=device)
     collector = BeamSearchCollector(
-        with_rows(env, [min(config.segments, len(data))]),
+        with_rows(env, [config.rows(len(data))]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, discriminator),
         rule=pruning_rule(config.search),
         prepare=lambda start: with_drawn_goals(env, goals, start, seed, config.search.goals),
-        **collector_settings(config.search, env, seed, data, config.segments),
+        **collector_settings(config.search, env, seed, data, config.rows(len(data))),
     )
-    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
+    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states, config.segments)
 
     # Losses and optimizers.
     policy_loss = processes.wrap_ddp(DistillationLoss(policy))

@@ -30,14 +30,14 @@ def mgail_h(config: TrainConfig, processes: Processes) -> Trainer:
     # Environment and collector: nothing is pruned; the goal policy draws the routes of rollouts.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=processes.device)
     collector = BeamSearchCollector(
-        with_rows(env, [min(config.segments, len(data))]),
+        with_rows(env, [config.rows(len(data))]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, discriminator),
         rule=KeepAll(),
         prepare=lambda start: with_drawn_goals(env, goals, start, seed, config.search.goals),
-        **collector_settings(config.search, env, seed, data, config.segments),
+        **collector_settings(config.search, env, seed, data, config.rows(len(data))),
     )
-    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
+    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states, config.segments)
 
     # Losses and optimizers.
     regression_loss, goal_loss = processes.wrap_ddp(BCLoss(policy)), processes.wrap_ddp(GoalLoss(goals))

@@ -29,14 +29,14 @@ def mgail_ts(config: TrainConfig, processes: Processes) -> Trainer:
     # Environment and collector: the discriminator prunes branches of every segment.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=processes.device)
     collector = BeamSearchCollector(
-        with_rows(env, [min(config.segments, len(data))]),
+        with_rows(env, [config.rows(len(data))]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, discriminator),
         rule=pruning_rule(config.search),
         prepare=branched_streams,
-        **collector_settings(config.search, env, seed, data, config.segments),
+        **collector_settings(config.search, env, seed, data, config.rows(len(data))),
     )
-    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states)
+    replay = SearchReplay(collector, env, data, config.search.updates, config.search.states, config.segments)
 
     # Losses and optimizers.
     regression_loss = processes.wrap_ddp(BCLoss(policy))

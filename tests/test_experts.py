@@ -16,9 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from helpers_runs import tiny
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony import keys
+from symphony.cli import main
 from symphony.config import PerturbConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.segment import RunSegment
@@ -32,6 +34,7 @@ from symphony.learning import experts as module
 from symphony.learning.demonstrations import ItemCache
 from symphony.learning.experts import VERSION, Experts, fit_experts
 from symphony.learning.perturbation import displaced, perturbed, way_back
+from symphony.recipes import train
 
 DYNAMICS = pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
 
@@ -162,6 +165,23 @@ def test_what_was_kept_is_what_was_fitted(store, dynamics, routes, monkeypatch):
     again = data(store, dynamics, routes=routes).experts.many([2, 0, 1])
     for a, b in zip(first, [again[1], again[2], again[0]], strict=True):
         same(a, b)
+
+
+@pytest.mark.parametrize("method", ["bc_h", "mgail"])
+def test_training_finds_all_that_was_prepared_by_whatever_workers(method, tmp_path, monkeypatch):
+    made, store = [], tmp_path / "store"
+    fill(store, [straight_road(4, steps=9), crossing(4, steps=8), straight_road(3, seed=1, steps=9)])
+    command = f"data prepare {store} --method {method} --workers"
+    for workers in (1, 2):
+        assert main([*command.split(), str(workers)]) == 0
+        made.append([file.read_bytes() for file in files(store)])
+        for file in files(store)[workers - 1 :]:  # in the end all but one
+            file.unlink()
+    assert made[0] == made[1]
+    assert (len(made[0]), len(files(store))) == (3, 1)
+    assert main([*command.split(), "1"]) == 0
+    monkeypatch.setattr("symphony.learning.demonstrations.fit_experts", None)  # nothing is fitted again
+    train(tiny(method, store, tmp_path / "run"))
 
 
 def test_another_action_space_or_duration_is_kept_apart(store: Path) -> None:

@@ -334,6 +334,27 @@ def test_what_is_never_bad_is_simulated_without_search(store, crowd):
     assert lines.search is None
 
 
+@pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
+@pytest.mark.parametrize(("kind", "crowd"), [("none", "all"), ("backtrack", 2)])
+def test_compiled_runs_are_the_runs_by_one_program_for_batches_of_few_shapes(store, kind, crowd, monkeypatch):
+    torch.compiler.reset()
+    programs: list[object] = []
+
+    def backend(graph, _):
+        programs.append(graph)
+        return graph.forward
+
+    monkeypatch.setitem(sys.modules["symphony.rollouts.search"].COMPILER, "backend", backend)
+    agent, how = make_agent(search=SEARCH), EvaluateConfig(search=kind, rollouts=2, score="rule")
+    how = replace(how, interactive=crowd, batch=4 if crowd == "all" else 2)  # whose sizes differ too much
+    parts = {"items": [0, 1, 2, 3]}
+    plain, compiled = (evaluate(agent, store, replace(how, compile=on), **parts) for on in ("no", "yes"))
+    assert len(programs) == 1
+    theirs, ours = compiled.metrics.compute(), plain.metrics.compute()
+    assert ours["collision_rate"] == theirs["collision_rate"]
+    assert {name: theirs[name] for name in ours} == pytest.approx(ours, rel=1e-4, abs=1e-5, nan_ok=True)
+
+
 def test_the_batch_changes_nothing_in_lines(store, monkeypatch):
     module = sys.modules["symphony.rollouts.search"]
     monkeypatch.setattr(module, "Backtrack", partial(Backtrack, cap=2.0))

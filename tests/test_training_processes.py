@@ -7,6 +7,7 @@ import resource
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ import helpers_distributed
 import helpers_killed
 from helpers_distributed import LOSSES, TRAINED
 from helpers_processes import output_of
-from helpers_runs import build, same_weights, tiny, weights
+from helpers_runs import build, pieces, same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
+from symphony import keys
 from symphony.agents.checkpoint import CheckpointError, checkpoints, latest, load_checkpoint
 from symphony.agents.choice import choose
 from symphony.errors import ConfigError, DataError, SymphonyError
@@ -70,6 +72,24 @@ def test_a_run_that_was_killed_at_many_a_moment_ends_like_one_that_was_not(store
     assert choose(part, "best").name == choose(whole, "best").name
     left = [p.relative_to(part) for p in part.rglob("*") if p.name.startswith(".")]
     assert left == []
+
+
+def test_searches_made_as_one_are_learned_from_in_turn(store, tmp_path):
+    """Two, each for two updates; with only one at a time all is as without."""
+    config = tiny("bc_ts", store, tmp_path / "run", segments=1, together=2)
+    trainer = build(replace(config, checkpoint_every=4))
+    replay, rng, seen = pieces(trainer)["replay"], torch.Generator().manual_seed(0), []
+    for step in range(8):
+        replay.refresh(step)
+        scenes = replay.env.scenes
+        drawn = [replay.both_kinds(rng), replay.survivors(30, rng, replay.env.observation)]
+        seen.append((id(scenes), {int(row) for batch in drawn for row in batch[keys.SCENE].flatten()}))
+        assert len(scenes) == 2
+    assert [rows for _, rows in seen] == [{0}, {0}, {1}, {1}] * 2
+    assert [len({one for one, _ in seen[k : k + 4]}) for k in (0, 4)] == [1, 1]
+    assert seen[0][0] != seen[4][0]
+    with pytest.raises(ConfigError, match=r"must be a multiple of search.updates \(2\) x 2 searches as one"):
+        build(config)
 
 
 def test_a_full_disk_stops_training_and_leaves_the_last_checkpoint(run, store, part):

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -31,7 +32,7 @@ from symphony.evaluation import Evaluation, evaluate
 from symphony.learning.demonstrations import SceneDataset
 from symphony.parallel import WorkerError, ordered_map
 from symphony.rollouts.unroll import NotFiniteError
-from symphony.rollouts.workers import batches, naming, shared
+from symphony.rollouts.workers import batches, naming, segments_together, shared
 from symphony.saved.folder import About, RolloutWriter
 from symphony.saved.rollouts import SavedRollouts
 from test_extremes import Spoiled
@@ -108,6 +109,15 @@ def test_batches_are_all_items_in_order_whoever_gets_them(items: int, batch: int
         assert all(len(part) == batch for part in found[:-1])
     elif workers > 1 and items >= 2 * workers:
         assert len(found) > workers  # nobody is left without one
+
+
+def test_a_card_is_filled_as_far_as_it_has_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent, found = make_agent(), []
+    for free in (1 << 20, 1 << 24, 1 << 28, 1 << 33, 1 << 37):
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _, free=free: (free, free))
+        found.append(segments_together(agent, EvaluateConfig(device="cuda:0", search="none"), 2))
+    assert found == sorted(found)
+    assert found[0] == 1 < found[1] < found[2] < found[3] == found[4] == 1024
 
 
 def spoiled() -> Any:

@@ -42,7 +42,9 @@ GONE = {
     "table --each": "a method that was simulated in several ways has a row for each",
     "table --format text": "`--format markdown`, as is the default, reads as text, too",
     "table --format latex": "`--format json` has the numbers, and pandoc turns Markdown into LaTeX",
-    "table --columns": "`symphony evaluate RUN --data DIR --details` prints these numbers",
+    "table --columns": "`symphony evaluate RUN --data DIR --json -` prints these numbers",
+    "evaluate --details": "`--json -` prints every number",
+    "simulate --metric": "`symphony evaluate --metric` computes them; they change no rollout",
     "train --agent.persona": "agents have no driving styles to be told",
     **dict.fromkeys(("evaluate --persona", "simulate --persona"), "agents have no driving styles to be told"),
     "wosac score --features": "`symphony.wosac.scorer.compute_features` gives them in Python",
@@ -124,6 +126,8 @@ def settle() -> None:
     """Settings of a process that is ours alone, before it loads torch; those of the user take precedence."""
     allocator.tune()
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin take the cores of a busy machine
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", os.path.join(cache, "symphony", "compiled"))
 
 
 def guarded(action: Callable[[], object]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import platform
 import shutil
@@ -59,10 +60,14 @@ class Evaluate(shared.Simulation):
     json: shared.Json = None
     figure: shared.ResultFile = None  # Picture (.png, .pdf or .svg) or animation (.gif) of some rollouts.
     save_rollouts: shared.Folder = None  # Folder for the rollouts that are evaluated (see `symphony view`).
-    details: bool = False  # Print every number of each agent, not only the table (see docs/metrics.md).
     keep: bool = True  # Leave the folder of the run as it is.
+    #: Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout.
+    metric: tuple[str, ...] = ()
     #: More scores for the record and `symphony table`: `wosac` (2025), 32 rollouts of everyone (see docs/wosac.md).
     metrics: tuple[Literal["wosac"], ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "config", dataclasses.replace(self.config, metric=self.metric))
 
     def __call__(self) -> None:
         from symphony.evaluation.records import evaluation_record, keep_evaluation
@@ -108,7 +113,7 @@ class Evaluate(shared.Simulation):
             record |= wosac_parts(scored, record)
         if shared.write_numbers(self.json, record):
             others = [one.numbers() for one in found.baselines if one.agent != found.agent]
-            shared.print_metrics([*others, found.numbers()], str(self.data), details=self.details)
+            shared.print_metrics([*others, found.numbers()], str(self.data))
             if self.metrics:
                 sys.stdout.write(wosac_table([scored.record()]))
         if self.keep and not chosen:

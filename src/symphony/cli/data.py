@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 
 import symphony
 from symphony.cli import shared
+from symphony.config import Method
 from symphony.config.checks import Bounds, Count, Natural, NotNegative, Positive
 from symphony.errors import ConfigError
 
@@ -189,6 +190,34 @@ class Convert(shared.Command):
         Info(store=out, interactive=0)()
         if report.warning:
             shared.tell(f"symphony: warning: {report.warning}")
+
+
+class Prepare(shared.Command):
+    """Fit the vehicles of a store beforehand, so that `symphony train` has no such work.
+
+    What was prepared is kept in the store's folder `experts`; a preparation that was interrupted is continued by the
+    same command, and equal arguments give equal files, whatever the number of workers.
+    """
+
+    store: shared.Store
+    method: Method = "bc_ts_h"  # Method to train, which decides the actions and whether there are routes.
+    duration: Natural = 0  # Seconds of each run segment that are to be used; 0: all there are.
+    accelerations: Annotated[int, Bounds(3, 1001)] = 7  # Levels of acceleration of the agent (methods bc*).
+    workers: shared.Workers = 1
+    engine: shared.EngineName = "local"
+
+    def __call__(self) -> None:
+        from symphony.envs.dynamics import Bicycle, Displacement
+        from symphony.learning.preparation import prepare
+
+        cloned = self.method.startswith("bc")
+        dynamics = Bicycle(num_acceleration=self.accelerations) if cloned else Displacement()
+        how: Any = {"routes": self.method.endswith("_h"), "duration": self.duration}
+        how |= {"workers": self.workers, "engine": self.engine}
+        with shared.progress("preparing") as advance:
+            for done, total in prepare(self.store, dynamics, **how):
+                advance(done, total)
+        shared.say(f"{total} run segments are prepared for {self.method} in {self.store}")
 
 
 class Merge(shared.Command):

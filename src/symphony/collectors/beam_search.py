@@ -33,6 +33,8 @@ from symphony.collectors.rules import Aggregate, KeepBest, Pruning, PruningRule,
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Score = Callable[[TensorDictBase], Tensor]
 Aggregation = Callable[[Tensor], Tensor]
+PROGRAMS = 64
+"""Programs that compiled searches of a process may have, at most: one for all states of a shape."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,8 @@ def beam_search(
         exploration_type: under which the policy runs.
 
     Raises:
-        ValueError: for an environment that can't be branched, arguments that contradict each other, or wrong shapes.
+        ValueError: for an environment that can't be branched, arguments that contradict each other, wrong shapes, or
+            what can't be compiled.
     """
     if not start.batch_dims or not start.numel() or steps < 1 or prune_every < 1:
         what = f"a start state of {list(start.shape)}, {steps} steps, pruned every {prune_every}"
@@ -168,14 +171,14 @@ def beam_search(
     # What a policy only writes is made anew at each step; all else, such as its memory, is carried on.
     written = [key for key in getattr(policy, "out_keys", ()) if key not in getattr(policy, "in_keys", ())]
     how = start.shape, policy, score, aggregate, keep, until_done, one_step, start, written
-    simulation = Simulation(env, whole, *how)
+    # One program for lines that go back, also when the last of them are few.
+    width = min(rule.width or start.numel(), start.numel()) if isinstance(rule, Backtrack) else 0
+    simulation = Simulation(env, whole, *how, width if compile_step else 0)
     ended = _ended(env, start, start.ndim)
     with set_exploration_type(exploration_type), branched_specs(policy, start.shape[:-1], start.shape):
         if isinstance(rule, Backtrack):
-            if leaves not in (None, branches) or compile_step:
-                raise ValueError(
-                    "rule Backtrack gives all branches as leaves, and its steps are not compiled"
-                )
+            if leaves not in (None, branches):
+                raise ValueError("rule Backtrack gives all branches as leaves")
             lines = follow(simulation.run, simulation.total, start, ended, rule, steps, prune_every)
             return _independent(lines, prune_every, keep_tree)
         periods = [min(prune_every, steps - first) for first in range(0, steps, prune_every)]
@@ -261,9 +264,15 @@ class Simulation:
     step: Callable[..., tuple[TensorDictBase, TensorDictBase, Tensor, Tensor]]
     start: TensorDictBase
     written: Sequence[NestedKey]
+    width: int = 0  # lines that are simulated at a time, the last again where there are fewer
 
     def run(self, now: TensorDictBase, ended: Bool[Tensor, "*b S K"], length: int) -> Run:
         """A period of some steps."""
+        if len(now) < self.width:
+            lines = torch.arange(self.width, device=ended.device).clamp_max(len(now) - 1)[:, None]
+            found = self.run(take(now, lines), take_values(ended, lines, 2), length)
+            records, after = ([one[: len(now)] for one in part] for part in (found.records, [found.after]))
+            return Run(records, *(part[: len(now)] for part in found[1:4]), *after)
         env = self.whole if now.shape == self.shape else branched_env(self.env, now.shape)
         recall(env, now)
         # Policy and environment write into the TensorDict they are given.
@@ -314,7 +323,18 @@ def _step(
 
 def _compiled(env: EnvBase, how: bool | Mapping[str, Any]) -> Callable[..., Any]:
     _ = env._step_mdp, env.done_keys, env.reward_keys  # kept once read, on which a program depends
-    return torch.compile(_step, fullgraph=True, **(how if isinstance(how, Mapping) else {}))
+    settings: dict[str, Any] = {"fullgraph": True, "recompile_limit": PROGRAMS}
+    program = torch.compile(_step, **settings, **(how if isinstance(how, Mapping) else {}))
+
+    def run(*given: Any) -> Any:
+        try:
+            return program(*given)
+        except Exception as error:
+            if not type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
+                raise
+            raise ValueError(f"a step can't be compiled: {str(error).strip().splitlines()[0]}") from error
+
+    return run
 
 
 def _ordered(state: TensorDictBase, like: TensorDictBase) -> TensorDictBase:

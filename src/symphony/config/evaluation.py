@@ -6,6 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
+from tyro.conf import Fixed, Suppress
+
 from symphony.config.agent import SearchConfig
 from symphony.config.checks import Bounds, Count, Names, Natural, NotNegative, Positive, Settings
 from symphony.errors import ConfigError
@@ -15,6 +17,7 @@ ScoreName = Literal["agent", "discriminator", "flags", "rule"]
 Goals = Literal["agent", "tree", "branch"]
 Others = Literal["log", "constant_velocity", "idm", "learned"]
 Engine = Literal["local", "ray"]
+Compile = Literal["auto", "yes", "no"]
 AfterCollision = Literal["go-on", "stop", "remove", "respawn"]
 MOST_INFLOW = 1.0
 """Vehicles per second that want to enter on a lane, at most: twice what one can carry."""
@@ -27,8 +30,15 @@ MOST = 128
 """Agents of a run segment that are driven, at most."""
 TOGETHER = 64
 """Run segments simulated at a time, at most, unless more are asked for: with more, each costs no less."""
+SEARCHES = 600
+"""Searches, one after the other, from which on compiling their steps pays on a device: each saves some .4 s."""
 MOST_SECONDS = 1e6
 """Seconds that a planner can be given for an answer, at most."""
+
+
+def compiles(choice: Compile, device: str, searches: int) -> bool:
+    """Whether the steps of so many searches (or batches of rollouts) are compiled on a device."""
+    return choice == "yes" or (choice == "auto" and device != "cpu" and searches >= SEARCHES)
 
 
 def check_planner_seconds(seconds: float) -> None:
@@ -107,14 +117,15 @@ class EvaluateConfig(SimulationConfig):
     #: Driver of the other vehicles: the `log`, `constant_velocity`, `idm` (a car-follower, along the route of the
     #: log) or the agent itself (`learned`). They are not evaluated; traffic is open for all but the log.
     others: Others = "log"
-    #: Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout.
-    metric: tuple[str, ...] = ()
-    #: Run segments simulated at a time (changes memory and speed, not results); 0: up to 64, or 16 with a planner,
-    #: fewer where their agents see many points.
+    metric: Annotated[tuple[str, ...], Fixed, Suppress] = ()  # Import paths of metrics of your own.
+    #: Run segments simulated at a time (changes memory and speed, not results); 0: up to 64, or 16 with a planner, on
+    #: a card up to 1 024, fewer where their agents see many points.
     batch: Natural = 0
     #: Engine that runs the worker processes: `local`, on this machine, or `ray`, on a Ray cluster (at RAY_ADDRESS,
     #: else one is started here).
     engine: Engine = "local"
+    #: Compile the steps of simulations, which takes minutes: `auto`, on a device where a run is long enough to win.
+    compile: Compile = "auto"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -11,6 +11,7 @@ from tyro.conf import Positional, Suppress, arg
 
 from symphony.config.agent import ActionSpace, AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
 from symphony.config.checks import Bounds, Count, Natural, NotNegative, Positive, Settings
+from symphony.config.evaluation import Compile, compiles
 from symphony.keys import SEEN
 
 Row = Literal["bc", "bc_h", "bc_ts", "bc_ts_h", "mgail", "mgail_h", "mgail_ts", "mgail_ts_h"]
@@ -25,6 +26,8 @@ GOALS = 128
 """Expert routes per update of the goal policy."""
 DISCRIMINATOR_RATE = 1e-3
 """Learning rate of the discriminator's Adam, falling to a tenth along a cosine."""
+ROWS, AGE = 256, 32
+"""Run segments that a card searches in the time of 16, and updates that states may be old that are learned from."""
 MAX_SEED = (1 << 40) - 1
 """Largest seed of a training, which derives a number from it for every update."""
 
@@ -114,6 +117,8 @@ class RunConfig(Settings):
     #: and WANDB_TAGS name project, group and tags.
     wandb: Literal["offline", "online", "disabled"] = "offline"
     device: str = "cpu"  # Device that learns: `cpu`, `cuda` or `cuda:N`.
+    #: Compile the steps of searches, which takes minutes: `auto`, on a device where a run is long enough to win.
+    compile: Compile = "auto"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +132,8 @@ class TrainConfig(RunConfig):
     duration: Natural = 0
     agent: AgentConfig = field(default_factory=AgentConfig)  # What the agent observes, its networks.
     segments: Annotated[Count, arg(name="batch")] = 16  # Run segments per update, and per search.
+    #: Searches made as one, for so many times `search.updates` to come; 0: one, on a device more (see `rows`).
+    together: Annotated[Natural, Suppress] = 0
     states: Count = 1024  # Expert states per update, drawn from those segments.
     perturb: PerturbConfig = field(default_factory=PerturbConfig)  # Displaced expert states.
     learning_rate: Positive = 1e-2  # Learning rate of Adam, falling to a tenth along a cosine.
@@ -154,8 +161,18 @@ class TrainConfig(RunConfig):
     @property
     def scenes(self) -> dict[str, Any]:
         """Which run segments are learned from and how they are drawn, as :class:`SceneDataset` takes it."""
-        one = self.agent
-        return {"interactive": one.interactive, "duration": self.duration}
+        few_shapes = compiles(self.compile, self.device, self.steps // self.search.updates)
+        how = {"interactive": self.agent.interactive, "duration": self.duration}
+        return how | {"few_shapes": few_shapes}
+
+    def rows(self, segments: int) -> int:
+        """Run segments searched as one, of so many that there are: on a device up to :data:`ROWS`, as long as no
+        update learns from states :data:`AGE` updates old, and checkpoints come between searches.
+        """
+        each, every = min(self.segments, segments), self.search.updates
+        most = 1 if self.device == "cpu" else min(ROWS // each, AGE // every, segments // each)
+        fits = (k for k in range(most, 1, -1) if self.checkpoint_every % (k * every) == 0)
+        return each * (min(self.together, segments // each) or next(fits, 1))
 
     def rates(self, optimizers: Iterable[str]) -> dict[str, float]:
         """Learning rates by network, before they fall."""

@@ -18,7 +18,7 @@ from symphony.envs.flags import collision_flags, offroad_flags
 from symphony.envs.objects import Objects, entering, everyone_at, rows_of
 from symphony.envs.observation import ObservationConfig, observation_spec, observe_states
 from symphony.envs.routes import route_choices
-from symphony.envs.scene import SceneBatch, SceneSource, Tables, leaving
+from symphony.envs.scene import SceneBatch, SceneSource, Tables, leaving, with_few_steps
 from symphony.errors import ConfigError
 from symphony.geometry.frames import with_speed
 from symphony.geometry.nearest import has_values, on_host
@@ -300,7 +300,9 @@ class DrivingEnv(EnvBase):
         if self.source is None or (not renew and self._scenes is not None):
             return torch.randint(len(self.scenes), tuple(shape), generator=self._rng)
         items = self.source.draw(shape.numel(), self._rng)
-        self.scenes = self.source.scenes(items).to(self.device)
+        scenes = self.source.scenes(items)
+        few = getattr(self.source, "few_shapes", False)
+        self.scenes = (with_few_steps(scenes) if few else scenes).to(self.device)
         # A source with fewer segments than the batch has rows gives some of them more than once.
         return (torch.arange(shape.numel()) % len(items)).reshape(shape)
 

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 SPACING = 2.0  # metres between the points that stand for a polyline in the observation
 BOUNDARY_TOLERANCE = 0.02  # metres by which the simplified road boundary may depart from the given one
 MARGIN = 5.0  # metres beyond the convex hull of the lanes that still belong to the map
+COORDINATES = 5  # of a logged state: no field has more of them
 BESIDE = 2.5  # metres to either side of the end of a lane within which an agent leaves by it
 
 
@@ -253,28 +254,45 @@ def scene(
     )
 
 
-def collate(scenes: Sequence[SceneBatch], agents: int = 0) -> SceneBatch:
+def few(size: int) -> int:
+    """The next of few sizes: multiples of 8, from 32 on four in every doubling; coordinates stay as they are."""
+    step = 1 << max(3, (size - 1).bit_length() - 3)
+    return size if size <= COORDINATES else -(-size // step) * step
+
+
+def collate(
+    scenes: Sequence[SceneBatch], agents: int = 0, shapes: dict[str, list[int]] | None = None
+) -> SceneBatch:
     """Stack scenes into one batch, padded to the largest of each size, and to so many interactive agents.
 
-    Padded steps repeat nothing: they are masked by ``log_valid`` and lie past ``last_step``. Raises a
-    :class:`DataError` for scenes of different time steps.
+    Padded steps repeat nothing: they are masked by ``log_valid`` and lie past ``last_step``. ``shapes`` of batches so
+    far, by field, let this one be no smaller, and its sizes :func:`few`, for programs that are compiled for shapes:
+    their number is at most one, and four for every doubling of a size since the first batch. Agents that are driven
+    and steps (:func:`with_few_steps`) are as many as there are. Raises a :class:`DataError` for scenes of different
+    time steps.
     """
     steps = torch.cat([item.dt for item in scenes])
     if bool((steps != steps[0]).any()):
         lengths = ", ".join(f"{dt:g} s" for dt in sorted(set(steps.tolist())))
         raise DataError(f"segments of different time steps in one batch: {lengths}", field="dt")
     parts, fields = [dict(item.items()) for item in scenes], {}
-    if any(part["point_height"].shape[1] for part in parts):
+    if any(part["point_height"].shape[1] for part in parts) or (shapes or {}).get("point_height", [0])[0]:
         parts = [part if part["point_height"].shape[1] else part | _no_heights(part) for part in parts]
     for name in SceneBatch.__annotations__:
         values = [part[name] for part in parts]
-        shapes = {value.shape[1:] for value in values}
-        if len(shapes) == 1 and name not in _AGENT_FIELDS:
-            fields[name] = torch.cat(values)
-            continue
-        shape = [max(sizes) for sizes in zip(*shapes, strict=True)]
+        each = {value.shape[1:] for value in values}
+        shape = [max(sizes) for sizes in zip(*each, strict=True)]
         if name in _AGENT_FIELDS:
             shape[0] = max(shape[0], agents)
+        if shapes is not None:
+            known = name in (*_AGENT_FIELDS, *_TIMED_FIELDS)
+            shape = [*shape[:known], *map(few, shape[known:])]
+            before = shapes.get(name, shape)
+            timed = name in _TIMED_FIELDS
+            shape = shapes[name] = [*shape[:timed], *map(max, shape[timed:], before[timed:])]
+        if each == {tuple(shape)}:
+            fields[name] = torch.cat(values)
+            continue
         fill = -1 if name in _INDEX_FIELDS else 0
         fields[name] = out = values[0].new_full((sum(v.shape[0] for v in values), *shape), fill)
         # Written by NumPy where it can be: some thousand small copies, of which each costs torch a few microseconds.
@@ -287,6 +305,17 @@ def collate(scenes: Sequence[SceneBatch], agents: int = 0) -> SceneBatch:
     return SceneBatch(**fields, batch_size=[len(fields["stream"])])
 
 
+def with_few_steps(scenes: SceneBatch) -> SceneBatch:
+    """Scenes with a number of logged steps out of :func:`few`, the last ones padding."""
+    found, more = scenes.clone(recurse=False), few(scenes.log_valid.shape[1]) - scenes.log_valid.shape[1]
+    for name in _TIMED_FIELDS:
+        value = getattr(scenes, name)
+        if value.shape[1]:
+            setattr(found, name, torch.nn.functional.pad(value, (*(0, 0) * (value.ndim - 2), 0, more)))
+    return found
+
+
+_TIMED_FIELDS = ("log_state", "log_valid", "light", "agent_height")
 _INDEX_FIELDS = ("point_light", "edge_previous", "edge_following")
 _AGENT_FIELDS = ["interactive", "interactive_valid", "enter", "background"]
 _AGENT_FIELDS += ["route_first", "route_count", "route_logged"]

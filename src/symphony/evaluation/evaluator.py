@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ from symphony.roadgraph import visited_curvatures
 from symphony.rollouts.crowd import crowd_dataset
 from symphony.rollouts.driving import Simulation, simulate_batch
 from symphony.rollouts.unroll import Rollouts, existing
-from symphony.rollouts.workers import batches, naming, segments_together, shared
+from symphony.rollouts.workers import batches, naming, segments_together, settled, shared
 from symphony.saved.rollouts import SavedRollouts, saved_rollouts
 
 BASELINES = ("playback", "constant_velocity")
@@ -106,8 +106,11 @@ def evaluate(
     agent.check_step(dataset.dt)
     others = [load_agent(name, config.device) for name in BASELINES] if baselines else []
     everyone = [agent, *(other for other in others if other.name != agent.name)]
+    size = segments_together(agent, config, dataset.interactive)
+    config = settled(config, dataset, -(-len(dataset) // size))
     # Baselines always do the same, and have no discriminator to search by.
-    once = dataclasses.replace(config, rollouts=1, trees=1, search="none", action_temperature=1.0)
+    alone: Any = {"rollouts": 1, "trees": 1, "search": "none", "action_temperature": 1.0, "compile": "no"}
+    once = dataclasses.replace(config, **alone)
     acting: int | Literal["all"] = "all" if config.interactive == "all" else dataset.interactive
     found = []
     for number, one in enumerate(everyone):
@@ -117,7 +120,7 @@ def evaluate(
     for path in config.metric:
         load_object(path)  # or complain before anything is simulated
     evaluator, done = _BatchEvaluator(everyone, found, dataset, observe is not None), 0
-    tasks = batches(range(len(dataset)), segments_together(agent, config, dataset.interactive), config)
+    tasks = batches(range(len(dataset)), size, config)
     with closing(shared(evaluator, tasks, config, dataset)) as results:
         for numbers, parts, seen in results:
             for whole, part in zip(found, parts, strict=True):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 FORMAT, FOLDER = 2, "evaluations"
 _LONGEST = 200  # letters in a name; file systems allow 255 with what is added while a file is written
-_MEMORY = ("batch", "device", "workers", "engine")  # settings that change no result
+_MEMORY = ("batch", "device", "workers", "engine", "compile")  # settings that change no result
 _NAMED = ("search", "trees", "branches", "rule", "prune_every", "temperature", "interactive", "rollouts")
 _USUAL = {
     field.name: field.default

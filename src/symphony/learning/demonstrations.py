@@ -118,6 +118,7 @@ class SceneDataset:
         duration: seconds of each segment that are used; 0 for all.
         keep: segments held in memory once they are prepared; None for as many as there is room for (a quarter of the
             machine's memory; 170 kB each in the built-in data, with routes).
+        few_shapes: pad batches to a few shapes (see :func:`symphony.envs.scene.collate`), for compiled programs.
 
     Raises:
         DataError: on access, for a segment shorter than the duration.
@@ -133,22 +134,29 @@ class SceneDataset:
         routes: bool = False,
         duration: float = 0,
         keep: int | None = None,
+        few_shapes: bool = False,
     ) -> None:
         self.store = store
         self.interactive = interactive
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
-        self.routes, self.duration, self.keep = routes, duration, keep
+        self.routes, self.duration, self.keep, self.few_shapes = routes, duration, keep, few_shapes
         self.scene = ItemCache(self._prepared, _nbytes, keep=keep, name="prepared run segments")
-        self.experts = ItemCache(self._experts, attrgetter("nbytes"), keep=keep, name="demonstrations")
+        self.experts = ItemCache(self.fit, attrgetter("nbytes"), keep=keep, name="demonstrations")
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
         # An update asks for the same ones twice, for states and for goals; what a batch derives stays with it.
-        self._batch = lru_cache(1)(lambda items: collate(self.scene.many(items)))
+        shapes: dict[str, list[int]] = {}
+        self._batch = lru_cache(1)(
+            lambda items: collate(self.scene.many(items), shapes=shapes if self.few_shapes else None)
+        )
+
+    @property
+    def _how(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ("routes", "duration", "keep", "few_shapes")}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        how: Any = {"routes": self.routes, "duration": self.duration, "keep": self.keep}
-        return partial(SceneDataset, **how), (self.store, self.interactive, self.dynamics, self.indices)
+        return partial(SceneDataset, **self._how), (self.store, self.interactive, self.dynamics, self.indices)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -214,7 +222,7 @@ class SceneDataset:
         found: SceneBatch = self._batch(tuple(items))
         return found
 
-    def _experts(self, items: Sequence[int]) -> list[Experts]:
+    def fit(self, items: Sequence[int]) -> list[Experts]:
         """The demonstrations of several items: those kept with the store, the others fitted together and kept."""
         contents = [self.store.content(self.indices[i]) for i in items]
         known = [self.kept.load(content) for content in contents]

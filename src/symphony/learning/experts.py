@@ -245,6 +245,11 @@ class KeptExperts:
         key = hashlib.sha256(f"{VERSION} {content} {self.settings}".encode()).hexdigest()
         return None if self.folder is None else self.folder / f"{key[:32]}.npz"
 
+    @property
+    def writable(self) -> bool:
+        """Whether something can be kept."""
+        return self.folder is not None and os.access(self.folder, os.W_OK)
+
     def load(self, content: str) -> Experts | None:
         """The demonstrations of the segment with this hash; None where there are none that can be read."""
         path = self._path(content)
@@ -271,7 +276,7 @@ class KeptExperts:
     def save(self, content: str, experts: Experts) -> None:
         """Keep the demonstrations of a segment, if the folder can be written and the disk has room."""
         path, routes = self._path(content), experts.routes
-        if path is None or not os.access(path.parent, os.W_OK):
+        if path is None or not self.writable:
             return
         arrays = {name: getattr(experts, name).numpy() for name in _TENSORS} | {
             "route_number": np.array([len(table.count) for table in routes], np.int64),

@@ -40,6 +40,11 @@ PRICE = 60.0
 class SearchReplay:
     """The last search and what is drawn from it, until the next.
 
+    Where the collector has the rows of K searches, these are made as one, at every update that K x `every` divides,
+    by the networks as they are then, and updates learn from one after the other: with the k-th of them (from 0) from
+    states that are k x `every` to (k + 1) x `every` - 1 updates old. K = 1 learns from the same states as a search
+    that is made when it is needed.
+
     Not one of TorchRL's replay buffers: a state names a row of the scenes that its search drew, so it ends with them,
     and what networks observe is made only for the states drawn.
 
@@ -49,24 +54,43 @@ class SearchReplay:
         data: that the environment draws its scenes from.
         every: updates made from one search.
         states: K, simulated and logged ones each, drawn for the discriminator.
+        segments: of one search, at most.
+
+    Attributes:
+        period: updates from one draw of scenes to the next, K x `every`.
     """
 
     def __init__(
-        self, collector: BeamSearchCollector, env: DrivingEnv, data: SceneDataset, every: int, states: int
+        self,
+        collector: BeamSearchCollector,
+        env: DrivingEnv,
+        data: SceneDataset,
+        every: int,
+        states: int,
+        segments: int,
     ) -> None:
         self.collector, self.env, self.data, self.every, self.states = collector, env, data, every, states
+        self.rows = min(segments, len(data))
+        self.period = every * (collector.env.batch_size[0] // self.rows)
+        self._found: TensorDictBase | None = None
         self._leaves: TensorDictBase | None = None
 
     def refresh(self, step: int) -> TensorDict:
         """Search if it is due at an update, or was never done; what the last search found out about itself:
         see :func:`search_statistics`.
         """
-        if self._leaves is None or step % self.every == 0:
+        if self._found is None or step % self.period == 0:
             try:
-                self._leaves = self.collector.rollout()
+                self._found = self.collector.rollout()
             except ValueError as error:  # of a rule of the user
                 raise ConfigError(str(error)) from error
+            self._leaves = None
+        if self._leaves is None or step % self.every == 0:
+            first = step % self.period // self.every * self.rows
+            self._leaves = self._found[first : first + self.rows]
             self._statistics = search_statistics(self.env, self._leaves)
+            self._searched = self._leaves[:, 0, 0].get(keys.SCENE).squeeze(-1)
+            self._scenes = self.env.scenes[self._searched]
         return self._statistics
 
     @property
@@ -147,7 +171,7 @@ class SearchReplay:
         return self.env.at(first[pick]).set(keys.NOISE_PLAN, self.leaves.get(keys.NOISE).flatten(0, 1)[pick])
 
     def _logged(self, count: int, rng: torch.Generator) -> TensorDict:
-        scenes = self.env.scenes
+        scenes = self._scenes
         state, logged, progress, *_ = self.data.fitted(scenes.segment.tolist(), scenes)
         rows = logged[:, 1:].any(-1).nonzero()
         scene, step = rows[torch.randint(len(rows), (count,), generator=rng).to(rows.device)].unbind(-1)
@@ -157,7 +181,7 @@ class SearchReplay:
         route = scenes.route_logged if self.env.observation.route else torch.full_like(scenes.interactive, -1)
         return TensorDict(
             {
-                keys.SCENE: scene[:, None],
+                keys.SCENE: self._searched[scene][:, None],
                 keys.STEP: step[:, None],
                 keys.STREAM: torch.zeros_like(scene)[:, None],
                 keys.VALID: valid,

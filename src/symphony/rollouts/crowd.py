@@ -119,8 +119,7 @@ class CrowdDataset(SceneDataset):
         return self.crowd.open_traffic
 
     def __reduce__(self) -> tuple[Any, ...]:
-        build = partial(CrowdDataset, routes=self.routes, duration=self.duration, keep=self.keep)
-        return build, (self.store, self.crowd, self.dynamics, self.indices)
+        return partial(CrowdDataset, **self._how), (self.store, self.crowd, self.dynamics, self.indices)
 
     def segment(self, i: int) -> RunSegment:
         """The run segment behind item ``i``, up to the duration, if need be past its log."""

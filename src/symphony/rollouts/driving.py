@@ -16,10 +16,10 @@ from symphony import keys
 from symphony.agents import Agent
 from symphony.collectors import Backtrack, BeamSearchResult, KeepAll, PruningRule, max_then_sum
 from symphony.config import EvaluateConfig
-from symphony.config.evaluation import Search, SimulateConfig
+from symphony.config.evaluation import Compile, Search, SimulateConfig
 from symphony.envs.dynamics import Bicycle, ConstantVelocity
 from symphony.envs.flags import offroad_flags
-from symphony.envs.scene import SceneBatch
+from symphony.envs.scene import SceneBatch, with_few_steps
 from symphony.errors import ConfigError
 from symphony.learning.experts import logged, logged_heights
 from symphony.metrics import collisions
@@ -27,7 +27,7 @@ from symphony.modules import SeededNoise
 from symphony.planners.driver import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.rollouts.background import CarFollower, constant_speed
 from symphony.rollouts.control import tempered
-from symphony.rollouts.search import going_back, pruning_rule, search
+from symphony.rollouts.search import COMPILER, going_back, no_value, pruning_rule, search
 from symphony.rollouts.unroll import (
     NaNGuard,
     Rollouts,
@@ -98,8 +98,10 @@ def simulation(
     ):
         raise ConfigError("beside log playback those with a planner are the only interactive agents")
     agent.check_step(float(scenes.dt[0]))
+    compiled = config.compile == "yes"
     after = config.after_collision if isinstance(config, SimulateConfig) else "go-on"
-    env = PlannedEnv(scenes, agent.dynamics, agent.observation, after_collision=after)
+    seen = with_few_steps(scenes) if compiled else scenes
+    env = PlannedEnv(seen, agent.dynamics, agent.observation, after_collision=after)
     kind, trees, branches, taken, settings = agent.plan(config)
     searches = kind not in ("none", "log")
     guard = NaNGuard(env, policy, [keys.LOGITS, keys.ACTION], "policy")
@@ -126,20 +128,22 @@ def simulation(
         goals_per=settings.goals,
         fix=fixed,
     )
-    if egos and kind == "backtrack":
-        raise ConfigError("a planner remembers what it saw, so it can't go back: --search none or tree")
+    if egos and (kind == "backtrack" or compiled):
+        what = "so it can't go back: --search none or tree, and is not compiled: --compile no"
+        raise ConfigError(f"a planner remembers what it saw, {what}")
     planned = EgoPolicy(env, egos, start, config.seed, CarFollower, forked=searches) if egos else None
     lure, actor = None if toward is None else toward(env, start), _acting(guard, env, config)
     for module in (planned, lure):
         actor = actor if module is None else TensorDictSequential(actor, module)
     # The rollouts [B, trees, taken] that count, of all branches.
     chosen, tree = torch.arange(taken, device=env.device).expand(len(scenes), trees, -1), None
-    if not searches:
+    if not searches and not compiled:
         noise = SeededNoise(config.seed, env.dynamics.numbers)
         found = simulate(env, TensorDictSequential(noise, actor), start)
         steps, ends, goal = start.numel() * env.decisions, start, start.get(keys.GOAL)
     else:
-        rule: PruningRule | Backtrack = KeepAll() if kind == "best" else pruning_rule(settings)
+        plain = kind in ("best", "none")
+        rule: PruningRule | Backtrack = KeepAll() if plain else pruning_rule(settings)
         if kind == "backtrack":
             rule = going_back(env, settings.threshold, start.numel(), renewed)
         with torch.no_grad():
@@ -156,7 +160,8 @@ def simulation(
                 also=() if planned is None else (keys.PLANNER,),
                 leaves=None if kind == "best" else taken,
                 keep_tree=keep_tree and kind == "tree",
-                value=None if lure is None else lure.value,
+                value=no_value if kind == "none" else lure and lure.value,
+                compile_step=COMPILER if compiled else False,
             )
         found, steps = rollouts_of(env, start, result.trajectories), result.simulated_steps
         ends = result.trajectories[..., -1]  # a copy of a branch follows the goals of its parent
@@ -166,7 +171,8 @@ def simulation(
             chosen = total.argsort(dim=-1, stable=True)[..., :1]
         elif kind == "tree":
             tree = result
-        else:  # lines are trees of one branch each; to be filled from each other they are the branches of one
+        elif kind == "backtrack":
+            # Lines are trees of one branch each; to be filled from each other they are the branches of one.
             begun = result.alive.squeeze(-2)[..., :: result.prune_every]
             # What follows an end is never bad.
             totals = torch.where(begun, result.totals.squeeze(-1), -torch.inf)
@@ -262,7 +268,9 @@ def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
     planner once for each branch; trees where there shall be branches.
     """
     kind: Search = "tree" if config.branches or config.trees > 1 else "none"
-    return dataclasses.replace(config, search=kind if config.search == "agent" else config.search)
+    compiled: Compile = "no" if config.compile == "auto" else config.compile
+    asked = kind if config.search == "agent" else config.search
+    return dataclasses.replace(config, search=asked, compile=compiled)
 
 
 def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) -> tuple[int, EvaluateConfig]:

@@ -38,6 +38,8 @@ FILL, FEW = 4, 256
 """Of lines that go back one in so many is simulated at a time, at least so many: the last steps are of few lines."""
 AHEAD = 0.5
 """Seconds that :func:`rule_score` looks ahead."""
+COMPILER = {"backend": "inductor"}
+"""How steps are compiled where they are, as :func:`torch.compile` takes it."""
 _KEPT = (
     *(keys.SCENE, keys.STEP, keys.STREAM, keys.VALID, keys.GOAL, keys.PROGRESS),
     *(keys.STATE, keys.ACTION, keys.NOISE),
@@ -73,8 +75,13 @@ def flag_score(state: TensorDictBase) -> Float[Tensor, "*b N"]:
 
 
 def no_score(state: TensorDictBase) -> Float[Tensor, "*b N"]:
-    """Score [..., N] of a search by the value of states alone."""
+    """Score [..., N] of a search by the value of states alone, or of none."""
     return torch.zeros_like(state.get(keys.STATE)[..., 0])
+
+
+def no_value(state: TensorDictBase) -> Float[Tensor, "*b"]:
+    """Value [...] of states that are all worth the same."""
+    return no_score(state)[..., 0]
 
 
 def rule_score(env: DrivingEnv, state: TensorDictBase) -> Float[Tensor, "*b N"]:
@@ -166,8 +173,9 @@ def collector_settings(
         "prune_every": config.prune_every,
         "rule_noise": pruning_noise(seed),
         **_settings(env, pruning_rule(config) if rule is None else rule),
-        "frames_per_batch": min(segments, len(data)) * config.branches * data.decisions,
+        "frames_per_batch": segments * config.branches * data.decisions,
         "total_frames": -1,
+        "compile_step": COMPILER if data.few_shapes else False,
     }
 
 

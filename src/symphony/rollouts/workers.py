@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pickle
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import lru_cache
 from typing import Any, TypeVar, cast
 
+import torch
+
 from symphony import allocator
 from symphony.agents import Agent
 from symphony.config import EvaluateConfig
-from symphony.config.evaluation import TOGETHER
+from symphony.config.evaluation import TOGETHER, compiles
 from symphony.errors import ConfigError, SymphonyError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.parallel import WorkerError, ordered_map
@@ -20,6 +23,8 @@ from symphony.rollouts.unroll import NotFiniteError
 
 POINTS = 1 << 19
 """Map points that all agents of a batch see together, at most: some 50 MB of features."""
+BYTES, FULL = 2048, 1024
+"""Bytes of a card for each of these points, with all that is computed from it, and run segments that fill a card."""
 IN_TRAFFIC, NAMED = 32, 8
 """Agents that a run segment is taken to have where everyone is driven; segments that an error names, at most."""
 
@@ -31,21 +36,36 @@ Work = Callable[[T], R]
 
 def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) -> int:
     """Run segments to simulate at a time: as many as the configuration says, by default up to ``TOGETHER``, as a step
-    of few agents costs little less than one of many; fewer if they see more than ``POINTS``.
+    of few agents costs little less than one of many; fewer if they see more than ``POINTS``. On a card up to
+    ``FULL``, fewer if its free memory has less than ``BYTES`` for each point that they see.
     """
     if config.batch:
         return config.batch
     everyone = config.interactive == "all" or config.open_traffic or config.others != "log"
     plan = agent.plan(config)
     agents = plan.trees * plan.branches * (IN_TRAFFIC if everyone else interactive)
-    found = min(max(1, POINTS // (agents * max(1, agent.observation.num_points))), TOGETHER)
+    card = torch.device(config.device)
+    points, most = POINTS, TOGETHER
+    if card.type == "cuda":
+        points, most = torch.cuda.mem_get_info(card)[0] // BYTES, FULL
+    found = min(max(1, points // (agents * max(1, agent.observation.num_points))), most)
     return found * FILL if plan.kind == "backtrack" else found
+
+
+def settled(config: EvaluateConfig, dataset: SceneDataset, searches: int) -> EvaluateConfig:
+    """The configuration of so many searches (or batches of rollouts) with its choice whether to compile made, for
+    which batches of the dataset are padded to few shapes.
+    """
+    dataset.few_shapes = compiles(config.compile, config.device, searches)
+    return dataclasses.replace(config, compile="yes" if dataset.few_shapes else "no")
 
 
 def batches(items: Sequence[int], size: int, config: EvaluateConfig) -> list[list[int]]:
     """Items in their order, so many at a time, by default so few that each of several workers gets two batches."""
     if config.workers > 1 and not config.batch:
         size = max(1, min(size, -(-len(items) // (2 * config.workers))))
+    if config.compile == "yes" and items:  # as equal as can be, since each size is a program
+        size = -(-len(items) // -(-len(items) // size))
     return [list(items[first : first + size]) for first in range(0, len(items), size)]
 
 

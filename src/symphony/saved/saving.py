@@ -23,11 +23,11 @@ from symphony.planners.identity import planner_settings
 from symphony.planners.interface import Named, Planners, planner_name
 from symphony.rollouts.control import given_goals
 from symphony.rollouts.driving import beside_planner, simulate_batch
-from symphony.rollouts.workers import batches, naming, segments_together, shared
+from symphony.rollouts.workers import batches, naming, segments_together, settled, shared
 from symphony.saved.folder import About, RolloutFolder, RolloutWriter
 from symphony.saved.rollouts import PLAYBACK, SavedRollouts, saved_rollouts
 
-_MEMORY = ("batch", "device", "metric", "workers", "engine")  # settings that change no rollout
+_MEMORY = ("batch", "device", "metric", "workers", "engine", "compile")  # settings that change no rollout
 PLANNED = 16  # run segments simulated at a time with a planner, of which each rollout has a copy
 
 
@@ -71,10 +71,12 @@ def save_simulation(
         if planner:
             todo = [i for i in todo if has_ego(writer, dataset, i, config.rollouts)]
         done = len(names) - len(todo)
-        drive = partial(_drive, agent, dataset, config, keep_tree, planners, planner_seconds, tuple(goals))
         most = PLANNED if planner and not config.batch else len(names)
         together = min(segments_together(agent, config, dataset.interactive), max(most, 1))
-        with closing(shared(drive, batches(todo, together, config), config, dataset)) as results:
+        config = settled(config, dataset, -(-len(todo) // together))
+        drive = partial(_drive, agent, dataset, config, keep_tree, planners, planner_seconds, tuple(goals))
+        tasks = batches(todo, together, config)
+        with closing(shared(drive, tasks, config, dataset)) as results:
             for saved in results:
                 for one in saved:
                     writer.add(one)

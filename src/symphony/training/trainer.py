@@ -56,7 +56,18 @@ ALARMS = {
     "records): its scores are chance; consider a higher rate, or more features or states for it",
 }
 """Values that `alarm` in the metrics may have, and what they mean."""
-FREE = ("out", "data", "steps", "resume", "device", "wandb", "preview", "checkpoint_every", "log_every")
+FREE = (
+    "out",
+    "data",
+    "steps",
+    "resume",
+    "device",
+    "wandb",
+    "preview",
+    "checkpoint_every",
+    "log_every",
+    "compile",
+)
 """Settings that may be others when a run goes on, which is no other run for more updates or another machine."""
 _SEED_STRIDE = 1_000_003
 
@@ -190,10 +201,13 @@ class Trainer:
         processes: Processes,
         replay: SearchReplay | None = None,
     ) -> None:
-        if replay is not None and config.checkpoint_every % replay.every:
+        if replay is not None and config.checkpoint_every % replay.period:
+            many = (
+                "" if replay.period == replay.every else f" x {replay.period // replay.every} searches as one"
+            )
             raise ConfigError(
                 f"checkpoint-every ({config.checkpoint_every}) must be a multiple of search.updates "
-                f"({replay.every}), so that a resumed run repeats no search"
+                f"({replay.every}){many}, so that a resumed run repeats no search"
             )
         self.config, self.agent, self.data, self.phases = config, agent, data, phases
         self.optimizers, self.rng, self.world, self.replay = dict(optimizers), rng, processes, replay
