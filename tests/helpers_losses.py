@@ -42,8 +42,10 @@ def spec(space: Any) -> AgentSpec:
     cells = 3 if space == "histogram" else 0
     return AgentSpec(
         action_space="displacement" if cells else space, dt=0.2, goals=True,
-        agent=AgentConfig(num_points=20, num_lights=2, features="gaps", cells=cells, hidden=8),
-        discriminator=DiscriminatorConfig(features="foresight", hidden=8), searches=True,
+        agent=AgentConfig(
+            num_points=20, num_lights=0 if cells else 2, features="paper" if cells else "gaps", cells=cells, hidden=8
+        ),
+        discriminator=DiscriminatorConfig(features="paper" if cells else "foresight", hidden=8), searches=True,
     )  # fmt: skip
 
 

@@ -88,7 +88,7 @@ def test_a_run_that_goes_on_rings_as_if_it_had_not_stopped(values: list[float | 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "store"
-    fill(path, [straight_road(4, seed=0, steps=8), crossing(4, seed=0, steps=8)])
+    fill(path, [straight_road(4, seed=0, steps=5), crossing(4, seed=0, steps=5)])
     return path
 
 
@@ -176,10 +176,10 @@ def test_training_gives_up_with_one_line(store, tmp_path, altered, capsys):
 def test_a_discriminator_that_has_won_raises_an_alarm(store, tmp_path, altered, capsys):
     altered(lambda step: {"discriminator_auc": 0.999 if step < WINDOW + 2 else 0.9})
     out, how = tmp_path / "run", {"steps": WINDOW + 4, "checkpoint_every": WINDOW + 2}
-    train(tiny("bc_ts", store, out, **how))
+    train(tiny("bc", store, out, **how))
     assert capsys.readouterr().err.count(f"warning: {ALARMS['discriminator_too_strong']}") == 1
     before = read_metrics(out)
     assert [r["step"] for r in before if "alarm" in r] == [WINDOW, WINDOW + 1, WINDOW + 2]
     shutil.rmtree(choose(out, str(WINDOW + 4)))
-    train(tiny("bc_ts", store, out, **how, resume=True))
+    train(tiny("bc", store, out, **how, resume=True))
     assert [r.get("alarm") for r in read_metrics(out)] == [r.get("alarm") for r in before]

@@ -68,7 +68,7 @@ def known_rate() -> float:
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return brief(tmp_path_factory.mktemp("data") / "store", (0, 19, 3))
+    return brief(tmp_path_factory.mktemp("data") / "store", (0, 19, 3), steps=21)
 
 
 @pytest.mark.parametrize("rule", [resampling(), Systematic()], ids=["seldom", "always"])
@@ -116,14 +116,14 @@ def test_near_is_whoever_is_ahead_and_a_hit_is_remembered() -> None:
 def test_the_command_finds_the_rate_of_free_rollouts_and_keeps_what_shows_it(store, tmp_path, capsys):
     coast, agent, out = EXAMPLES / "coast.py", "pretrained:bc_ts_h", tmp_path / "out"
     words = f"{agent} --planner {coast}:plan --data {store} --segments 1".split()
-    kept = f"--metric collision_rate --trees 6 --branches 8 --out {out} --json -".split()
+    kept = f"--metric collision_rate --trees 4 --branches 8 --out {out} --json -".split()
     assert main(["hunt", *words, *kept]) == 0
     segment, mean = json.loads(capsys.readouterr().out)
     assert (segment["rate"], segment["error"], mean["segment"]) == (mean["rate"], mean["error"], None)
-    assert main(["simulate", *words, "--rollouts", "64", "--out", str(tmp_path / "free")]) == 0
+    assert main(["simulate", *words, "--rollouts", "32", "--out", str(tmp_path / "free")]) == 0
     rate = report(load_rollouts(tmp_path / "free"), "ego").totals()["collision_rate"] / 100
     assert 0 < rate < 1
-    assert abs(mean["rate"] - rate) < 3 * math.hypot(mean["error"], math.sqrt(rate * (1 - rate) / 64))
+    assert abs(mean["rate"] - rate) < 3 * math.hypot(mean["error"], math.sqrt(rate * (1 - rate) / 32))
     capsys.readouterr()
     (saved,) = load_rollouts(out)
     assert saved.rollouts == segment["kept"] > 0

@@ -47,7 +47,7 @@ def test_readers_conform(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("name", "pattern", "count"), [
     ("womd", "womd/*.tfrecord", 1),
     ("commonroad", "commonroad/*.xml", 5),
-    ("scenarionet", "real/scenarionet/*.pkl", 3),
+    ("scenarionet", "real/scenarionet/*.pkl", 2),
     ("commonroad", "commonroad/ngsim/USA_Lanker-2_10*.xml", 1),
     pytest.param("argoverse2", "argoverse2/*.parquet", 1, marks=needs_pyarrow),
 ])  # fmt: skip

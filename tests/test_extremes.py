@@ -30,7 +30,7 @@ from symphony.errors import SymphonyError
 from symphony.evaluation import evaluate
 from symphony.rollouts.unroll import NotFiniteError
 
-STEPS = 5
+STEPS = 4
 
 
 def road(**changes: Any) -> schema.RunSegment:

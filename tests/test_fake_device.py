@@ -114,7 +114,7 @@ def test_the_pretended_device_notices():
 
 
 def test_simulations_stay_on_the_device():
-    with world("displacement") as (_, agent, env):  # a search simulates the other space
+    with world("histogram") as (_, agent, env):  # a search simulates the other space
         policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
         found = simulate(env, policy, start_states(env, agent.goals, trees=2, branches=1, seed=0))
         assert found.state.shape == (2, 2, 1, LOGGED, 2, 4)

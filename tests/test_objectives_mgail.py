@@ -114,7 +114,7 @@ def test_it_is_the_mean_cost_of_what_the_actor_drives_into(env, cost):
 def test_gradients_by_differences(env, arguments):
     td, loss, eps = planned(env, steps=5), make(env, **arguments), 1e-6
     pairs = list(zip(loss.parameters(), value_and_gradient(loss, td)[1], strict=True))
-    for weight, gradient in pairs[::3]:
+    for weight, gradient in pairs[::5]:
         at, values = gradient.abs().argmax(), []
         for sign in (1, -1):
             with torch.no_grad():

@@ -43,8 +43,8 @@ make_pretrained = load_script("make_pretrained")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "town" / "train"
     with StoreWriter(path) as writer:
-        writer.append(straight_road(4, steps=8))
-        writer.append(crossing(4, seed=1, steps=6))
+        writer.append(straight_road(4, steps=5))
+        writer.append(crossing(4, seed=1, steps=5))
     return path
 
 

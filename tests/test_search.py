@@ -370,7 +370,8 @@ def test_the_batch_changes_nothing_in_lines(store, monkeypatch):
     assert torch.equal(whole.goal[[2, 0], :, :agents], part.goal)
 
 
-def test_lines_avoid_what_they_are_judged_by(store):
+def test_lines_avoid_what_they_are_judged_by(store, monkeypatch):
+    monkeypatch.setattr(sys.modules["symphony.rollouts.search"], "Backtrack", partial(Backtrack, cap=3.0))
     ways = (replace(how, rollouts=16) for how in (NONE, replace(LINES, score="flags"), LINES))
     none, *lines = (collisions(crowds(store, [4], how, goals=False)) for how in ways)
     assert none > 0.3

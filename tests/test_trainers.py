@@ -260,6 +260,7 @@ def test_recipe(run_script: Any, tmp_path: Path, method: str, capsys: pytest.Cap
     (file,) = (tmp_path / "run" / "evaluations").iterdir()
     found = json.loads(file.read_text())
     assert found["run"]["method"] == method
+    assert found["config"]["search"] == ("tree" if "_ts" in method else "none")
     assert found["playback"]["ade"] == 0
     assert found["ade"] > 0
     assert len(found["per_segment"]) == 2

@@ -36,7 +36,7 @@ PLAN = "def plan(seen):\n    return {}\n"
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "store"
-    return fill(path, [crossing(5, seed=seed, steps=8) for seed in range(3)]).path
+    return fill(path, [crossing(5, seed=seed, steps=6) for seed in range(3)]).path
 
 
 @pytest.fixture(scope="module")
