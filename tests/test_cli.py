@@ -131,7 +131,7 @@ def test_bounds_are_told_as_they_are_typed(args: str, told: str, capsys: Any) ->
 
 
 def test_what_is_required_shows_no_default(told: dict[str, str]) -> None:
-    for command in ("plot curves", "data merge", "table", "planners", "wosac table"):
+    for command in ("plot curves", "data merge", "table", "planners"):
         assert re.search(r"\.\.\. +[A-Z][^()]*(\([^()]*\)[^()]*)?\(required\)", told[command]), command
 
 

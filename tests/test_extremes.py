@@ -219,7 +219,7 @@ def test_other_time_steps(scenes, dt, tmp_path):
 
 LENGTHS = (6, 4, 6)
 """Steps of the segments ``straight-0``, ``crossing-1`` and ``crossing-2``."""
-SEARCHES = (("none", "best"), ("best", "best"), ("tree", "systematic"), ("backtrack", "best"))
+SEARCHES = (("none", "best"), ("tree", "systematic"), ("backtrack", "best"))
 
 
 @pytest.fixture(scope="module")

@@ -104,7 +104,6 @@ SEARCHES = [
     {"search": "none"},
     TREE,
     {"search": "tree", "branches": 6, "rule": "systematic", "trees": 2},
-    {"search": "best", "branches": 2},
 ]
 
 
@@ -327,7 +326,7 @@ def test_the_command_simulates_reports_and_shows(store, tmp_path, monkeypatch, c
 @given(
     runs=st.integers(1, 300),
     segments=st.integers(1, 600),
-    search=st.sampled_from(["none", "tree", "best"]),
+    search=st.sampled_from(["none", "tree"]),
     trees=st.sampled_from([1, 2, 16]),
 )
 def test_runs_are_spread_over_as_many_segments_as_there_are(runs, segments, search, trees):

@@ -37,7 +37,7 @@ from symphony.rollouts.search import rule_score, search
 from symphony.rollouts.unroll import Rollouts, draw_goals, rollouts_of
 
 SEARCH = {"branches": 4, "test_branches": 4, "prune_every": 2}
-KINDS = ("none", "tree", "backtrack", "best")
+KINDS = ("none", "tree", "backtrack")
 SEGMENTS = [crossing(3, seed=1, steps=5), straight_road(4, seed=0, steps=8)]
 SEGMENTS += [crossing(4, seed=2, steps=6), straight_road(3, seed=3, steps=5)]
 DECISIONS = 7
@@ -180,7 +180,6 @@ def test_neither_discriminator_nor_search_touches_the_goals(scenes, agent, monke
     assert len(drawn[0][1, :, 0].unique()) > 1  # else there is nothing to bias
     for scorer, score in ((agent, "discriminator"), (other, "discriminator"), (agent, "flags")):
         states.append(driven(scorer, scenes, score=score, trees=5, **how).rollouts.state)
-    states.append(driven(other, scenes, "best", score="discriminator", trees=1, **how).rollouts.state)
     assert all(torch.equal(goals, drawn[0]) for goals in drawn)
     # Each of them does change what survives.
     assert all(not torch.equal(a, b) for a, b in pairwise(states))
@@ -257,17 +256,6 @@ def test_with_nothing_to_replace_a_search_is_independent_rollouts(agent, scenes)
         assert (left[:, :, None] == free.goal[:, None]).all(-1).any(-1).all()
 
 
-def test_best_is_the_best_of_independent_rollouts(scenes, env, agent):
-    found = driven(agent, scenes, "best", rollouts=2, branches=3, logged_goals=True, seed=5).rollouts
-    start = start_of(env, 6)
-    every = plain(env, agent, start)
-    scores = scored(env, agent, start, every.state).masked_fill(~every.counted, -torch.inf)
-    best = scores.amax(2).sum(-1).unflatten(1, (2, 3)).argmin(-1) + 3 * torch.arange(2)
-    for b in range(4):
-        assert same(Rollouts(*(part[b] for part in found)), Rollouts(*(part[b, best[b]] for part in every)))
-    assert best.unique().numel() > 2
-
-
 def blocked():
     """On a wide road the ego follows two cars that brake to a stand; the first of them is interactive too."""
     steps, dt = 21, 0.2
@@ -305,7 +293,7 @@ def test_an_oracle_avoids_what_it_knows():
 
 
 def test_kinds_and_sizes_that_do_not_fit_are_refused(store, agent):
-    for kind in ("tree", "best", "backtrack"):
+    for kind in ("tree", "backtrack"):
         with pytest.raises(ConfigError, match="needs an agent with a discriminator"):
             evaluate(replace(agent, discriminator=None), store, EvaluateConfig(search=kind))
     with pytest.raises(ConfigError, match="less than 16 rollouts"):

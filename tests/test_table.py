@@ -266,7 +266,7 @@ TREE = {"search": "tree", "trees": 1, "branches": 16, "rule": "best"}
 
 
 def test_names_differ_with_everything_that_changes_results() -> None:
-    same = {"batch", "device", "workers", "engine"}
+    same = {"batch", "device", "workers", "engine", "compile"}
     assert {field.name for field in dataclasses.fields(EvaluateConfig)} == CHANGES.keys() | same
     base = make_record(**TREE)
     others = [base | {"config": base["config"] | {name: value}} for name, value in CHANGES.items()]
@@ -274,7 +274,7 @@ def test_names_differ_with_everything_that_changes_results() -> None:
     others.append(base | {"run": {"named": True, "checkpoint": 50}})
     names = [evaluation_name(record) for record in (base, *others)]
     assert len(set(names)) == len(names)
-    changes = {"batch": 3, "device": "cuda", "workers": 2, "engine": "ray"}
+    changes = {"batch": 3, "device": "cuda", "workers": 2, "engine": "ray", "compile": "yes"}
     assert evaluation_name(others[0] | {"config": others[0]["config"] | changes}) == names[1]
     # Included agents keep evaluations by such names.
     replace = make_record(**TREE | {"rule": "replace", "prune_every": 2, "threshold": 1.0, "goals": "branch"})

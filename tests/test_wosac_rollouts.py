@@ -53,10 +53,11 @@ from symphony.wosac.simulate import (
     wosac_rollouts,
 )
 from symphony.wosac.submission import check_submission, required_agents
-from symphony.wosac.table import COLUMNS, read_wosac, wosac_table
+from symphony.wosac.table import COLUMNS, wosac_table
 from test_selection import CASES, scene
 
 AGENT = "pretrained:bc_ts_h"
+BASELINES = ["log playback", "constant velocity", "intelligent driver model"]
 RANDOM = "random"
 PLAIN = WosacSettings(search="none")
 SEARCH = WosacSettings(search="tree", branches=2)
@@ -441,7 +442,7 @@ def test_the_record_has_the_score_and_tables_have_its_columns(tmp_path, capsys, 
     usual = WosacSettings.of
     monkeypatch.setattr(WosacSettings, "of", lambda config: replace(usual(config), horizon=2.0))
     fill(tmp_path / "store", [straight_road(2, seed=k, group=f"recording {k}") for k in range(2)])
-    one, two, data = tmp_path / "one.json", tmp_path / "two.json", str(tmp_path / "store")
+    one, data = tmp_path / "one.json", str(tmp_path / "store")
     how = ("--json", str(one), "--rollouts", "2", "--metrics", "wosac")
     assert main(["evaluate", RANDOM, "--data", data, *how]) == 0
     record = json.loads(one.read_text())
@@ -461,21 +462,13 @@ def test_the_record_has_the_score_and_tables_have_its_columns(tmp_path, capsys, 
     with pytest.raises(ConfigError, match="WOSAC scores of 2024, 2025"):
         compare([entries[0], replace(entries[1], record=year)], "main")
     # The table of scores.
-    one.write_text(json.dumps(scores))
-    alone = scores | {"agents": {RANDOM: whole[RANDOM]}}
-    two.write_text(json.dumps(alone))
-    capsys.readouterr()
-    assert main(["wosac", "table", str(two), str(one), "--names", "two", "one"]) == 0
-    rows = [line.split("|")[1:] for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
-    drivers = ["log playback", "constant velocity", "intelligent driver model", "random"]
-    assert [row[0].strip() for row in rows] == ["", "---", *drivers, "two", "one"]
-    for column, cell in zip(COLUMNS, rows[-1][1:], strict=False):
-        value, error = column.scale * whole[RANDOM][column.key], 0.51 * 10**-column.digits
-        assert float(cell.split(" ± ")[0]) == pytest.approx(value, abs=error)
-    for changes in ({"how": scores["how"] | {"horizon": 5.0}}, {"config": "2024"}):
-        with pytest.raises(ConfigError, match="different run segments, years or horizons"):
-            wosac_table([alone, alone | changes])
-    for text in ("{}", "[]", "nothing", json.dumps({"agent": "a", "agents": {"b": {}}})):
-        two.write_text(text)
-        with pytest.raises(DataError, match=r"two\.json: not a record of symphony wosac evaluate"):
-            read_wosac(two)
+    for agents, drivers in ((whole, [*BASELINES, "random"]), ({RANDOM: whole[RANDOM]}, [])):
+        rows = [
+            line.split("|")[1:]
+            for line in wosac_table(scores | {"agents": agents}).splitlines()
+            if line[:2] == "| "
+        ]
+        assert [row[0].strip() for row in rows] == ["", "---", *drivers, "random, no search"]
+        for column, cell in zip(COLUMNS, rows[-1][1:], strict=False):
+            value, error = column.scale * whole[RANDOM][column.key], 0.51 * 10**-column.digits
+            assert float(cell.split(" ± ")[0]) == pytest.approx(value, abs=error)

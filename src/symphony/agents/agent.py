@@ -129,7 +129,7 @@ FILE = "agent.json"  # file in a run's folder that holds the agent's specificati
 class SearchPlan(NamedTuple):
     """How the rollouts of a run segment come about, with nothing left open."""
 
-    kind: Literal["log", "none", "tree", "backtrack", "best"]  # of search; log for playback
+    kind: Literal["log", "none", "tree", "backtrack"]  # of search; log for playback
     trees: int  # of the run segment; independent rollouts are trees of one branch
     branches: int  # of each tree
     taken: int  # rollouts taken from each tree
@@ -196,7 +196,7 @@ class Agent:
         """
         search = config.pruning(self.search)
         blind = search.score == "discriminator" and self.discriminator is None
-        kind: Literal["log", "none", "tree", "backtrack", "best"] = "log"
+        kind: Literal["log", "none", "tree", "backtrack"] = "log"
         if self.policy is not None and config.search != "agent":
             kind = config.search
         elif self.policy is not None:
@@ -206,7 +206,7 @@ class Agent:
             raise ConfigError(f"{what}, or another score: --score flags or rule")
         branches, trees = search.test_branches, config.trees
         if kind != "tree":
-            return SearchPlan(kind, config.rollouts, branches if kind == "best" else 1, 1, search)
+            return SearchPlan(kind, config.rollouts, 1, 1, search)
         if config.rollouts // trees > branches:
             what = f"{trees} trees of {branches} branches give less than {config.rollouts} rollouts"
             raise ConfigError(what)

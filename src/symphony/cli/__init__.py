@@ -27,6 +27,7 @@ __all__ = ["main"]
 
 FAILED, USAGE, ALL_FAILED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 143  # how commands end, beside 0
 GONE = {
+    "wosac table": "`symphony table` shows the scores of runs that were evaluated with `--metrics wosac`",
     "evaluate --wosac-config": "`symphony wosac evaluate` takes the year as --config",
     "data info --routes": "`symphony plot routes` draws them",
     "data info --per-segment": "the JSON always says which agents were chosen in each run segment",
@@ -42,8 +43,7 @@ GONE = {
     "table --each": "a method that was simulated in several ways has a row for each",
     "table --format text": "`--format markdown`, as is the default, reads as text, too",
     "table --format latex": "`--format json` has the numbers, and pandoc turns Markdown into LaTeX",
-    "table --columns": "`symphony evaluate RUN --data DIR --json -` prints these numbers",
-    "evaluate --details": "`--json -` prints every number",
+    "table --columns": "`symphony evaluate RUN --data DIR --details` prints these numbers",
     "simulate --metric": "`symphony evaluate --metric` computes them; they change no rollout",
     "train --agent.persona": "agents have no driving styles to be told",
     **dict.fromkeys(("evaluate --persona", "simulate --persona"), "agents have no driving styles to be told"),

@@ -60,6 +60,7 @@ class Evaluate(shared.Simulation):
     json: shared.Json = None
     figure: shared.ResultFile = None  # Picture (.png, .pdf or .svg) or animation (.gif) of some rollouts.
     save_rollouts: shared.Folder = None  # Folder for the rollouts that are evaluated (see `symphony view`).
+    details: bool = False  # Print every number of each agent, not only the table (see docs/metrics.md).
     keep: bool = True  # Leave the folder of the run as it is.
     #: Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout.
     metric: tuple[str, ...] = ()
@@ -113,9 +114,9 @@ class Evaluate(shared.Simulation):
             record |= wosac_parts(scored, record)
         if shared.write_numbers(self.json, record):
             others = [one.numbers() for one in found.baselines if one.agent != found.agent]
-            shared.print_metrics([*others, found.numbers()], str(self.data))
+            shared.print_metrics([*others, found.numbers()], str(self.data), details=self.details)
             if self.metrics:
-                sys.stdout.write(wosac_table([scored.record()]))
+                sys.stdout.write(wosac_table(scored.record()))
         if self.keep and not chosen:
             keep_evaluation(agent.name, record)
         if self.figure is not None:

@@ -159,8 +159,8 @@ COLUMNS = (
 """Numbers in the table of agents, with the two lines of their headings, and digits."""
 
 
-def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
-    """Print records of agents as one table and a line of what they are of."""
+def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, details: bool = False) -> None:
+    """Print records of agents as one table and a line of what they are of; with details, all of their numbers."""
     heads = ["agent\n", *(heading for _, heading, _ in COLUMNS)]
     table = [[heading.split("\n")[k] for heading in heads] for k in range(2)]
     named = [{**row, "agent": short_name(str(row["agent"]))} for row in rows]
@@ -171,6 +171,8 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "") -> None:
     for row in named:
         for name in (name for name in row if ":" in name and not name.endswith("_se")):  # the user's own
             say(f"{row['agent']}: {name} {number_cell(row[name], row.get(f'{name}_se'), 4)}")
+        if details:
+            print_facts({name: value for name, value in row.items() if name != "agent"}, row["agent"])
     first, most = rows[0], max(row["rollouts"] for row in rows)
     driven = "all vehicles" if first["interactive"] == "all" else f"{first['interactive']} interactive agents"
     if first["interactive"] not in ("all", 1, 2):  # a segment with fewer has those that there are

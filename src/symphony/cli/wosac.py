@@ -82,23 +82,9 @@ class Evaluate(shared.Command):
         with shared.progress(f"scoring {agent.name}") as advance:
             found = wosac.evaluate_wosac(agent, store, items, self.settings, self.config, advance, **how)
         if shared.write_numbers(self.json, found.record()):
-            sys.stdout.write(wosac_table([found.record()]))
+            sys.stdout.write(wosac_table(found.record()))
         for line in left_out(found.left_out):
             shared.tell(f"left out: {line}")
-
-
-class Table(shared.Command):
-    """Put the scores of several agents on the same run segments into one table (Markdown), after the baselines."""
-
-    #: Files that `symphony wosac evaluate --json FILE` wrote.
-    records: Annotated[Positional[shared.Paths], arg(metavar="FILE ...")]
-    names: shared.Names = ()  # Names of the agents; by default what the records say.
-    out: shared.ResultFile = None  # File to write it to; otherwise it is printed.
-
-    def __call__(self) -> None:
-        from symphony.wosac.table import read_wosac, wosac_table
-
-        shared.write_text(self.out, wosac_table([read_wosac(file) for file in self.records], self.names))
 
 
 class Submit(shared.Command):

@@ -12,7 +12,7 @@ from symphony.config.agent import SearchConfig
 from symphony.config.checks import Bounds, Count, Names, Natural, NotNegative, Positive, Settings
 from symphony.errors import ConfigError
 
-Search = Literal["agent", "none", "tree", "backtrack", "best"]
+Search = Literal["agent", "none", "tree", "backtrack"]
 ScoreName = Literal["agent", "discriminator", "flags", "rule"]
 Goals = Literal["agent", "tree", "branch"]
 Others = Literal["log", "constant_velocity", "idm", "learned"]
@@ -52,8 +52,7 @@ class SimulationConfig(Settings):
     """How an agent is simulated, whatever the rollouts are for."""
 
     #: Search that the rollouts come from. `agent`: the agent's own; `none`: no search; `tree`: beam search;
-    #: `backtrack`: independent rollouts, each of which goes back and tries again where it is bad; `best`:
-    #: independent rollouts, of which that with the best score counts.
+    #: `backtrack`: independent rollouts, each of which goes back and tries again where it is bad.
     search: Search = "agent"
     #: Score that a search lowers. `agent`: as is best for the agent (the discriminator, unless its card says
     #: something else); `discriminator`: what the agent's own calls unreal; `flags`: collisions and time off the

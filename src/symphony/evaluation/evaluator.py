@@ -48,7 +48,7 @@ class Evaluation:
     metrics: RolloutMetrics
     config: EvaluateConfig
     interactive: int | Literal["all"]  # agents per segment that acted, at most
-    search: str  # how the rollouts came about: `none`, `tree`, `backtrack`, `best`; `log` for playback
+    search: str  # how the rollouts came about: `none`, `tree`, `backtrack`; `log` for playback
     own: dict[str, dict[str, float]] = field(default_factory=dict)  # by import path, means by run segment
     seconds: float = 0.0  # CPU time of the simulation
     steps: int = 0  # of rollouts or branches that were simulated, those that a search dropped included

@@ -90,7 +90,7 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
         "interactive": result.interactive,
         "duration": config.duration or agent.duration,
         "goals": used.goals if tree else "tree",
-        "branches": used.test_branches if search in ("tree", "best") else 0,
+        "branches": used.test_branches if tree else 0,
         "trees": config.trees if tree else 0,
         "rule": used.rule if tree else "",
         "prune_every": used.prune_every if search in ("tree", "backtrack") else 0,
@@ -118,13 +118,11 @@ def evaluation_name(record: dict[str, Any]) -> str:
 
 
 def simulation_way(config: Mapping[str, Any]) -> str:
-    """Return how rollouts came about: ``none``, ``best-of-16``, ``tree-1x16-replace-every2-goals=branch``."""
+    """Return how rollouts came about: ``none``, ``tree-1x16-replace-every2-goals=branch``."""
     return "-".join([*_search_words(config), *_unusual_words(config)])
 
 
 def _search_words(config: Mapping[str, Any]) -> list[str]:
-    if config["search"] == "best":
-        return [f"best-of-{config['branches']}"]
     words = [config["search"]]
     words += [f"{config['trees']}x{config['branches']}", config["rule"]] if config["trees"] else []
     words += [f"every{config['prune_every']}"] if config.get("prune_every") else []

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from symphony import keys
 from symphony.agents import Agent
-from symphony.collectors import Backtrack, BeamSearchResult, KeepAll, PruningRule, max_then_sum
+from symphony.collectors import Backtrack, BeamSearchResult, KeepAll, PruningRule
 from symphony.config import EvaluateConfig
 from symphony.config.evaluation import Compile, Search, SimulateConfig
 from symphony.envs.dynamics import Bicycle, ConstantVelocity
@@ -142,8 +142,7 @@ def simulation(
         found = simulate(env, TensorDictSequential(noise, actor), start)
         steps, ends, goal = start.numel() * env.decisions, start, start.get(keys.GOAL)
     else:
-        plain = kind in ("best", "none")
-        rule: PruningRule | Backtrack = KeepAll() if plain else pruning_rule(settings)
+        rule: PruningRule | Backtrack = KeepAll() if kind == "none" else pruning_rule(settings)
         if kind == "backtrack":
             rule = going_back(env, settings.threshold, start.numel(), renewed)
         with torch.no_grad():
@@ -158,7 +157,7 @@ def simulation(
                 score=settings.score,
                 planned=len(egos),
                 also=() if planned is None else (keys.PLANNER,),
-                leaves=None if kind == "best" else taken,
+                leaves=taken,
                 keep_tree=keep_tree and kind == "tree",
                 value=no_value if kind == "none" else lure and lure.value,
                 compile_step=COMPILER if compiled else False,
@@ -166,10 +165,7 @@ def simulation(
         found, steps = rollouts_of(env, start, result.trajectories), result.simulated_steps
         ends = result.trajectories[..., -1]  # a copy of a branch follows the goals of its parent
         goal = ends.get(keys.GOAL)
-        if kind == "best":
-            total = max_then_sum(result.scores, result.alive[..., None])
-            chosen = total.argsort(dim=-1, stable=True)[..., :1]
-        elif kind == "tree":
+        if kind == "tree":
             tree = result
         elif kind == "backtrack":
             # Lines are trees of one branch each; to be filled from each other they are the branches of one.

@@ -265,7 +265,7 @@ def simulated_how(agent: Agent, settings: WosacSettings) -> dict[str, Any]:
         "logged_goals": (agent.goals is not None, settings.logged_goals),
         "action_temperature": (settings.action_temperature != 1.0, settings.action_temperature),
         "score": (kind != "none" and pruning.score != "discriminator", pruning.score),
-        "branches": (kind in ("tree", "best"), branches),
+        "branches": (kind == "tree", branches),
         "rule": (kind == "tree", pruning.rule),
         "prune_every": (kind in ("tree", "backtrack"), pruning.prune_every),
         "goals": (kind == "tree", pruning.goals),

@@ -1,13 +1,8 @@
-"""A table of WOSAC scores from the records that `symphony wosac evaluate` wrote."""
+"""A table of WOSAC scores."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
-
-from symphony.errors import ConfigError, DataError
 
 
 class Column(NamedTuple):
@@ -37,50 +32,26 @@ _WORDS = {
 }
 
 
-def read_wosac(file: Path) -> dict[str, Any]:
-    """A record of `symphony wosac evaluate`. Raises a :class:`DataError` where it is none; names the file."""
-    try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-        record["agents"][record["agent"]]["segments"], record["how"], record["data"]["checksum"]
-    except (ValueError, TypeError, LookupError) as error:
-        text = f"not a record of symphony wosac evaluate ({type(error).__name__}: {error})"
-        raise DataError(text, file=file) from error
-    return dict(record)
-
-
-def wosac_table(records: Sequence[dict[str, Any]], names: Sequence[str] = ()) -> str:
-    """A table in Markdown: the baselines of the first record that has them, a line for the agent of each record, by
-    its name or what the record calls it and how it was simulated, and what the table is of. Raises a
-    :class:`ConfigError` for different run segments, years or horizons, or too few names.
-    """
-    if names and len(names) != len(records):
-        raise ConfigError(f"{len(names)} names for {len(records)} records")
-    first = records[0]
-    for record in records:
-        if _what(record) != _what(first):
-            raise ConfigError(
-                f"records of different run segments, years or horizons: {first['agent']}, {record['agent']}; "
-                "a table is of the same ones"
-            )
-    order: dict[str, Any] = next((one["agents"] for one in records if len(one["agents"]) > 1), {})
-    rows = [(_WORDS[name], numbers) for name, numbers in order.items() if name in _WORDS]
-    for k, record in enumerate(records):
-        name = names[k] if names else f"{record['agent']}, {how_in_words(record['how'])}"
-        rows.append((name, record["agents"][record["agent"]]))
+def wosac_table(record: dict[str, Any]) -> str:
+    """A table in Markdown: the baselines of a record that has them, its agent, and what the table is of."""
+    name, found = record["agent"], record["agents"]
+    rows = [
+        (_WORDS[other], numbers) for other, numbers in found.items() if other in _WORDS and len(found) > 1
+    ]
+    rows.append((f"{name}, {how_in_words(record['how'])}", found[name]))
     lines = [["", *(column.title for column in COLUMNS), "order kept %"], ["---"] * (len(COLUMNS) + 2)]
-    for name, numbers in rows:
+    for row, numbers in rows:
         kept = numbers["order"]["kept"]
         cells = [_cell(numbers, column) for column in COLUMNS]
-        lines.append([name, *cells, "–" if kept is None else f"{100 * kept:.0f}"])
+        lines.append([row, *cells, "–" if kept is None else f"{100 * kept:.0f}"])
     table = "".join(f"| {' | '.join(line)} |\n" for line in lines)
-    return f"{table}\n{_note(first)}.\n"
+    return f"{table}\n{_note(record)}.\n"
 
 
 def how_in_words(how: dict[str, Any]) -> str:
     """How rollouts came about, such as ``32 trees of 4, systematic every 2, sampled goals``."""
     way = {
         "tree": "32 trees of {branches}, {rule} every {prune_every}",
-        "best": "the best of {branches}",
         "backtrack": "back where bad, every {prune_every}",
     }.get(how["search"], "no search")
     goals = {True: ", logged goals", False: ", sampled goals", None: ""}[how.get("logged_goals")]
@@ -99,11 +70,6 @@ def _note(record: dict[str, Any]) -> str:
         f"each; ± standard error over recordings; order of {numbers['order']['pairs']} pairs that merge or cross in "
         "the log"
     )
-
-
-def _what(record: dict[str, Any]) -> tuple[Any, ...]:
-    segments = list(record["agents"][record["agent"]]["segments"])
-    return record["config"], record["data"]["checksum"], segments, record["how"].get("horizon", HORIZON)
 
 
 def _cell(numbers: dict[str, Any], column: Column) -> str:
