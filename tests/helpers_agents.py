@@ -12,9 +12,7 @@ from symphony.agents import Agent, build_agent
 from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, SearchConfig
 
 
-def make_agent(
-    space: Any = "bicycle", cells: int = 0, seed: int = 0, search: Any = (), **changes: Any
-) -> Agent:
+def make_agent(space: Any = "bicycle", cells: int = 0, seed: int = 0, search: Any = (), **more: Any) -> Agent:
     """Untrained, with goals and a discriminator; a fifth of the time of one that comes with the package.
 
     The search has settings of its own, and so has all else of the specification.
@@ -25,7 +23,7 @@ def make_agent(
         discriminator=DiscriminatorConfig(hidden=8), searches=True,
         search=SearchConfig(**{"test_branches": 2, "prune_every": 3, **dict(search)}),
     )  # fmt: skip
-    return build_agent("tiny", replace(spec, **changes))
+    return build_agent("tiny", replace(spec, **more))
 
 
 small = cache(make_agent)

@@ -27,9 +27,7 @@ def points(line: Iterable[tuple[float, float]]) -> list[dict[str, float]]:
     return [{"x": float(FAR[0] + x), "y": float(FAR[1] + y), "z": 21.5} for x, y in line]
 
 
-def track(
-    columns: Columns, name: str, kind: str, steps: range, start: Any, speed: float, category: int = 1
-) -> None:
+def track(columns: Any, name: str, kind: str, steps: range, start: Any, speed: float, category=1) -> None:
     """Add a track at constant speed along +x (or -x)."""
     for step in steps:
         who = {"track_id": name, "object_type": kind, "object_category": category, "timestep": step}
@@ -54,9 +52,7 @@ def scenario(steps: int = 20) -> Columns:
     return columns | {name: [value] * len(columns["timestep"]) for name, value in same.items()}
 
 
-def lane(
-    lane_id: int, y: float, begin: float, end: float, width: float = 3.6, **changes: Any
-) -> dict[str, Any]:
+def lane(lane_id: int, y: float, begin: float, end: float, width: float = 3.6, **more: Any) -> dict[str, Any]:
     """A straight lane from ``begin`` to ``end`` (towards -x where that is less)."""
     side = np.sign(end - begin) * width / 2
     middle = (begin + end) / 2
@@ -67,7 +63,7 @@ def lane(
     }
     paint = dict.fromkeys(("left_lane_mark_type", "right_lane_mark_type"), "NONE")
     links = {"successors": [], "predecessors": [], "left_neighbor_id": None, "right_neighbor_id": None}
-    return {"id": lane_id, "lane_type": "VEHICLE", **lines, **paint, **links, **changes}
+    return {"id": lane_id, "lane_type": "VEHICLE", **lines, **paint, **links, **more}
 
 
 def city() -> dict[str, Any]:
@@ -94,13 +90,7 @@ def city() -> dict[str, Any]:
     }
 
 
-def write(
-    folder: Path,
-    columns: Columns | None = None,
-    map_: Any = None,
-    name: str = NAME,
-    types: dict[str, Any] | None = None,
-) -> Path:
+def write(folder: Path, columns: Any = None, map_: Any = None, name: str = NAME, types: Any = None) -> Path:
     """Write a scenario (the made one by default) and its map; columns get the type of their values or ``types``."""
     import pyarrow as pa
     from pyarrow import parquet

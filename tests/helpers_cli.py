@@ -43,13 +43,11 @@ def commands(app: SubcommandApp = cli.app, *before: str) -> list[tuple[str, ...]
 
 
 def _words(told: str) -> Iterator[str]:
-    title = ""
+    first = option = "--?[a-z]"
     for line in told.splitlines():
         if re.match(r" \w", line):
-            title = line.split()[0]
-        elif found := re.match(
-            r"  (\S.*?)(  |$)" if title == "positional" else r"  (--?[a-z].*?)(  |$)", line
-        ):
+            first = r"\S" if line.split()[0] == "positional" else option
+        elif found := re.match(rf"  ({first}.*?)(  |$)", line):
             names = re.findall(r"(?<!\S)--?[a-z][\w.-]*", found[1]) or [found[1]]
             if names[0] != "-h":
                 yield ", ".join(names)

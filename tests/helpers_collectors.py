@@ -105,9 +105,8 @@ def assert_same(first: TensorDictBase, second: TensorDictBase) -> None:
     """The same entries with the same values, to the last bit."""
     assert set(first.keys(True, True)) == set(second.keys(True, True))
     for key in first.keys(True, True):
-        torch.testing.assert_close(
-            first.get(key), second.get(key), rtol=0, atol=0, equal_nan=True, msg=str(key)
-        )
+        one, other = first.get(key), second.get(key)
+        torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True, msg=str(key))
 
 
 class Mass(EnvBase):
@@ -142,14 +141,9 @@ class Mass(EnvBase):
         self.rng.manual_seed(0 if seed is None else seed)
 
     def _made(self, seen: Tensor, over: Tensor, **more: Tensor) -> TensorDict:
-        entries = {
-            "place": seen,
-            "observation": seen.clone(),
-            "done": over,
-            "terminated": over.clone(),
-        } | more
+        more |= {"place": seen, "observation": seen.clone(), "done": over, "terminated": over.clone()}
         shape = seen.shape[: -1 - len(self.shape_of_one)]
-        found = TensorDict(entries, seen.shape[:-1])
+        found = TensorDict(more, seen.shape[:-1])
         return found if self.group is None else TensorDict({self.group: found}, shape)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:

@@ -18,12 +18,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils import backend_registration as registration
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils.backend_registration import (
-    _DummyBackendModule,
-    _DummyPrivateUse1Hook,
-    _setup_privateuseone_for_python_backend,
-)
 from torchrl.data import Composite, Unbounded
 
 from symphony.envs import DrivingEnv
@@ -80,7 +76,7 @@ class _Watch(TorchDispatchMode):
         return out
 
 
-class _Backend(_DummyBackendModule):
+class _Backend(registration._DummyBackendModule):
     """What PyTorch and TensorDict take for the device's module, such as ``torch.cuda``."""
 
     pretended: PretendDevice | None = None
@@ -105,7 +101,7 @@ _MADE = constants.made.__wrapped__
 BACKEND = _Backend()
 
 
-class _Hook(_DummyPrivateUse1Hook):
+class _Hook(registration._DummyPrivateUse1Hook):
     def is_available(self) -> bool:
         return BACKEND.is_available()
 
@@ -113,7 +109,7 @@ class _Hook(_DummyPrivateUse1Hook):
 # Without it PyTorch knows the device, but can't index its tensors. At once, because autograd counts the devices when
 # it first runs in a process.
 if torch._C._get_privateuse1_backend_name() != NAME:
-    _setup_privateuseone_for_python_backend(NAME, BACKEND, _Hook())
+    registration._setup_privateuseone_for_python_backend(NAME, BACKEND, _Hook())
 
 
 @contextmanager

@@ -138,9 +138,8 @@ def main(rank: int, store: Path, out: Path) -> None:
     with processes(CPU) as world:
         found["world"] = [world.rank, world.count, world.is_main]
         nan, inf = float("nan"), float("inf")
-        own = {
-            "both": float(rank), "one": 3.0 if rank else nan, "none": nan, "infinite": inf if rank else 1.0,
-        }  # fmt: skip
+        own = {"both": float(rank), "none": nan}
+        own |= {"one": 3.0, "infinite": inf} if rank else {"one": nan, "infinite": 1.0}
         mean = world.mean({name: torch.tensor(value) for name, value in own.items()})
         found["mean"] = {name: value.item() for name, value in mean.items()}
         found["losses"] = {kind: compare(kind, store, world) for kind in LOSSES}
@@ -180,14 +179,18 @@ def both(store: Path, out: Path) -> int:
     if Path("/sys/class/net/lo").exists():
         # Else gloo asks for the address of the machine's name, which may have none.
         os.environ["GLOO_SOCKET_IFNAME"] = "lo"
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    # As torchrun does.
-    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(WORLD)}
-    os.environ["TORCHELASTIC_RUN_ID"] = "test"
-    children = [fork(main, rank, store, out) for rank in range(WORLD)]
-    codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
+    codes = as_torchrun(main, store, out)
     del os.environ["TORCHELASTIC_RUN_ID"]
     codes.append(os.waitstatus_to_exitcode(os.waitpid(fork(alone, store, out), 0)[1]))
     return int(any(codes))
+
+
+def as_torchrun(action: Callable[..., None], *args: Any) -> list[int]:
+    """Have processes that know of each other do something, their ranks first; how they ended."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(WORLD)}
+    os.environ["TORCHELASTIC_RUN_ID"] = "test"
+    children = [fork(action, rank, *args) for rank in range(WORLD)]
+    return [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,17 +17,12 @@ PLACES += [(46, -3), (46, 11), (50, -3), (50, 11)]
 NODES = dict(enumerate(PLACES, start=1))
 BORDER, DASHED = {"type": "road_border"}, {"type": "line_thin", "subtype": "dashed"}
 WAYS = {
-    21: ((1, 2), BORDER),
-    22: ((3, 4), DASHED),
+    21: ((1, 2), BORDER), 22: ((3, 4), DASHED),
     23: ((6, 5), BORDER),  # drawn against the traffic
-    24: ((2, 7), BORDER),
-    25: ((4, 8), DASHED),
-    26: ((6, 9), BORDER),
-    27: ((10, 11), {"type": "pedestrian_marking"}),
-    28: ((12, 13), {"type": "pedestrian_marking"}),
-    29: ((2, 6), {"type": "stop_line"}),
-    30: ((7, 8), {"type": "traffic_sign", "subtype": "de206"}),
-}
+    24: ((2, 7), BORDER), 25: ((4, 8), DASHED), 26: ((6, 9), BORDER),
+    27: ((10, 11), {"type": "pedestrian_marking"}), 28: ((12, 13), {"type": "pedestrian_marking"}),
+    29: ((2, 6), {"type": "stop_line"}), 30: ((7, 8), {"type": "traffic_sign", "subtype": "de206"}),
+}  # fmt: skip
 ROAD = {"type": "lanelet", "subtype": "road"}
 LANELETS = {
     101: (22, 21, ROAD | {"maxspeed": "50"}, (201, 202)), 102: (23, 22, ROAD, ()), 103: (25, 24, ROAD, ()),
@@ -59,13 +55,7 @@ def node(name: int, x: float, y: float, how: str) -> str:
     return f"<node id='{name}' lat='{lat:.11f}' lon='{lon:.11f}'/>"
 
 
-def osm(
-    how: str = "xy",
-    nodes: Mapping[int, tuple[float, float]] = NODES,
-    ways: Mapping[int, tuple[Iterable[int], Mapping[str, str]]] = WAYS,
-    lanelets: Mapping[int, tuple[int, int, Mapping[str, str], tuple[int, ...]]] = LANELETS,
-    rules: Mapping[int, tuple[Mapping[str, str], Mapping[str, int]]] = RULES,
-) -> str:
+def osm(how="xy", nodes: Any = NODES, ways: Any = WAYS, lanelets: Any = LANELETS, rules: Any = RULES) -> str:
     """A map: by default two lanes of 100 m in two parts each, along +x, between y = 0 and 8."""
     parts = [node(name, *place, how) for name, place in nodes.items()]
 
@@ -94,11 +84,7 @@ FENCES = {61: (41, 42, 43), 62: (43, 44), 63: (44, 41), 64: (51, 52), 65: (52, 5
 PARKING = {"subtype": "parking"}
 
 
-def with_area(
-    tags: Mapping[str, str] = PARKING,
-    turned: tuple[bool, ...] = (False,) * 5,
-    members: str = "61o 62o 63o 64i 65i",
-) -> str:
+def with_area(tags: Any = PARKING, turned=(False,) * 5, members="61o 62o 63o 64i 65i") -> str:
     """The default map with a relation of type multipolygon, whose ways are drawn in either direction."""
     ways = {
         name: (refs[::-1] if turn else refs, {"type": "fence"})
@@ -114,29 +100,16 @@ COLUMNS = "track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy,psi_rad,length,wi
 WALKERS = "track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy"
 
 
-def track(
-    name: int | str,
-    x: float = 0.0,
-    y: float = 2.0,
-    speed: float = 10.0,
-    steps: range = range(120),
-    kind: str = "car",
-    logged: float = 1.0,
-) -> list[str]:
+def track(name: Any, x=0.0, y=2.0, speed=10.0, steps=range(120), kind="car", logged=1.0) -> list[str]:
     """Rows of a car at constant speed along +x, its velocity logged that many times too large."""
-    rows = []
-    for k in steps:
-        where = f"{x + speed * k / 10:.4f},{y:.4f},{logged * speed:.4f},0.0,0.0,4.5,2.0"
-        rows.append(f"{name},{k + 1},{100 * k},{kind},{where}")
-    return rows
+    more = f"{y:.4f},{logged * speed:.4f},0.0,0.0,4.5,2.0"
+    return [f"{name},{k + 1},{100 * k},{kind},{x + speed * k / 10:.4f},{more}" for k in steps]
 
 
 def walker(name: str, speed: float = 1.5, steps: range = range(120)) -> list[str]:
     """Rows of somebody who crosses the road at x = 48, in the file of pedestrians and bicycles."""
-    return [
-        f"{name},{k + 1},{100 * k},pedestrian/bicycle,48.0,{-4 + speed * k / 10:.4f},0.0,{speed}"
-        for k in steps
-    ]
+    kind = "pedestrian/bicycle,48.0"
+    return [f"{name},{k + 1},{100 * k},{kind},{-4 + speed * k / 10:.4f},0.0,{speed}" for k in steps]
 
 
 def text(rows: Iterable[str], columns: str = COLUMNS) -> str:
@@ -146,9 +119,7 @@ def text(rows: Iterable[str], columns: str = COLUMNS) -> str:
 CARS = [*track(3), *track(5, x=-10, y=6, speed=9), *track(9, x=20, speed=0, y=2)]
 
 
-def public(
-    folder: Path, rows: Iterable[str] = CARS, walkers: Iterable[str] = (), scene: str = "DR_X"
-) -> Path:
+def public(folder: Path, rows: Iterable[str] = CARS, walkers: Iterable[str] = (), scene="DR_X") -> Path:
     """A recording in the public layout; returns the file of tracks."""
     tracks, maps = folder / "recorded_trackfiles" / scene, folder / "maps"
     tracks.mkdir(parents=True, exist_ok=True)
@@ -161,11 +132,8 @@ def public(
     return path
 
 
-META = (
-    "id,frameRate_hz,originLat,originLon,spatAvailible\n"
-    f"000,10,{ORIGIN[0]},{ORIGIN[1]},no\n"
-    f"001,10,{ORIGIN[0]},{ORIGIN[1]},yes\n"
-)
+META = [f"{part},10,{ORIGIN[0]},{ORIGIN[1]},{lit}" for part, lit in (("000", "no"), ("001", "yes"))]
+META = text(META, "id,frameRate_hz,originLat,originLon,spatAvailible")
 
 
 def place(source: int, point: tuple[float, float], sinks: str = "", groups: str = "") -> str:
@@ -181,11 +149,8 @@ PLACEMARKS = place(1, (49, 2), "11, 12", "7, 8") + place(2, (49, 6), "12", "8")
 PLACEMARKS += place(11, (101, 2)) + place(12, (101, 6))
 KML = f"<kml xmlns='http://www.opengis.net/kml/2.2'><Document>{PLACEMARKS}</Document></kml>\n"
 STATES = {7: ("STOP_AND_REMAIN", "PERMISSIVE_MOVEMENT_ALLOWED"), 8: ("DARK", "PRE_MOVEMENT")}
-PHASES = "signal_group_id,timestamp_ms,movement_state\n" + "".join(
-    f"{group},{time},{states[time >= 2000]}\n"
-    for group, states in STATES.items()
-    for time in range(0, 12000, 1000)
-)
+PHASES = [f"{k},{t},{states[t >= 2000]}" for k, states in STATES.items() for t in range(0, 12000, 1000)]
+PHASES = text(PHASES, "signal_group_id,timestamp_ms,movement_state")
 
 
 def taf(folder: Path, part: str = "001", rows: Iterable[str] = CARS) -> Path:

@@ -12,6 +12,7 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import helpers_distributed
 import helpers_runs
 from symphony.config import TrainConfig, ValidationConfig
 from symphony.recipes import train
@@ -62,17 +63,13 @@ def die_at(name: str, count: int, file: str, report: int) -> None:
 
 def live(settings: TrainConfig, death: tuple[str, int, str] | None = None) -> int:
     """Train in a process of its own; returns how it ended."""
-    child = os.fork()
-    if child == 0:
-        status = 1
-        try:
-            if death is not None:
-                die_at(*death, os.dup(1))
-            train(settings)
-            status = 0
-        finally:
-            os._exit(status)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+    def life() -> None:
+        if death is not None:
+            die_at(*death, os.dup(1))
+        train(settings)
+
+    return os.waitstatus_to_exitcode(os.waitpid(helpers_distributed.fork(life), 0)[1])
 
 
 def main(store: Path, out: Path, method: str) -> int:

@@ -8,13 +8,7 @@ import inspect
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import (
-    InteractionType,
-    NormalParamExtractor,
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-)
+from tensordict import nn as parts
 from torch import nn
 from torch.distributions import Categorical, Independent, Normal
 
@@ -27,9 +21,10 @@ def categorical_actor(classes=7, observation=OBSERVATION, action=ACTION, kind=Ca
     torch.manual_seed(0)
     network = nn.Sequential(nn.Linear(4, 16), nn.ReLU(), nn.Linear(16, classes))
     keys = {"logits": LOGITS} if mask is None else {"logits": LOGITS, "mask": mask}
-    how = {"distribution_class": kind, "default_interaction_type": InteractionType.RANDOM}
-    head = ProbabilisticTensorDictModule(in_keys=keys, out_keys=[action], **how)
-    return ProbabilisticTensorDictSequential(TensorDictModule(network, [observation], [LOGITS]), head)
+    how = {"distribution_class": kind, "default_interaction_type": parts.InteractionType.RANDOM}
+    head = parts.ProbabilisticTensorDictModule(in_keys=keys, out_keys=[action], **how)
+    body = parts.TensorDictModule(network, [observation], [LOGITS])
+    return parts.ProbabilisticTensorDictSequential(body, head)
 
 
 def independent_normal(loc, scale):
@@ -38,10 +33,11 @@ def independent_normal(loc, scale):
 
 def gaussian_actor(observation=OBSERVATION, action=ACTION):
     torch.manual_seed(0)
-    network = nn.Sequential(nn.Linear(4, 4), NormalParamExtractor())
+    network = nn.Sequential(nn.Linear(4, 4), parts.NormalParamExtractor())
     keys = {name: name if observation == "observation" else ("agents", name) for name in ("loc", "scale")}
-    head = ProbabilisticTensorDictModule(keys, [action], distribution_class=independent_normal)
-    return ProbabilisticTensorDictSequential(TensorDictModule(network, [observation], [*keys.values()]), head)
+    head = parts.ProbabilisticTensorDictModule(keys, [action], distribution_class=independent_normal)
+    body = parts.TensorDictModule(network, [observation], [*keys.values()])
+    return parts.ProbabilisticTensorDictSequential(body, head)
 
 
 def batch(*shape, agents=3, classes=7, continuous=False):

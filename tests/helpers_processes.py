@@ -96,10 +96,8 @@ def _run(function: Callable[..., Any], given: tuple[Any, ...], said: Path | None
     if said is not None:
         for stream, name in enumerate((str(said), f"{said}.err"), 1):
             os.dup2(os.open(name, os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o600), stream)
-    status = 1
-    signal.pthread_sigmask(
-        signal.SIG_UNBLOCK, {signal.SIGINT}
-    )  # the server was started while interrupts were put off
+    status = 1  # and the server was started while interrupts were put off
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
         status = int(function(*given) or 0)
     except BaseException:

@@ -6,7 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from symphony.data.segment import Polylines, RoadMap
+import helpers_segments as segments
+from symphony.data.segment import Polylines
 
 
 def make_road(lines, edges=(), left=(), right=(), types=None):
@@ -16,15 +17,11 @@ def make_road(lines, edges=(), left=(), right=(), types=None):
     def pairs(names):
         return np.array([(index[a], index[b]) for a, b in names], np.int32).reshape(-1, 2)
 
-    count = len(lines)
-    nothing = Polylines.of([])
-    road = RoadMap(
-        lanes=Polylines.of([np.asarray(line, float) for line in lines.values()]),
-        lane_id=np.arange(count, dtype=np.int64),
+    road, unknown = segments.make_road(list(lines.values())), np.full(len(lines), np.nan, np.float32)
+    road = dataclasses.replace(
+        road, lane_id=np.arange(len(lines)), speed_limit=unknown, lane_width=unknown,
         lane_type=np.array([(types or {}).get(name, 2) for name in lines], np.uint8),
-        speed_limit=np.full(count, np.nan, np.float32), lane_width=np.full(count, np.nan, np.float32),
-        successors=pairs(edges), left_neighbors=pairs(left), right_neighbors=pairs(right), boundary=nothing,
-        marks=nothing, mark_type=np.zeros(0, np.uint8),
+        successors=pairs(edges), left_neighbors=pairs(left), right_neighbors=pairs(right),
     )  # fmt: skip
     return road, index
 
@@ -63,14 +60,10 @@ def crossing():
     right of the middle of the road, arms are 60 m long, and the connectors begin 10 m from the centre.
     """
     lines, edges = {}, []
-    shapes = {
-        # Seen from the south arm, driving north along x = 2.
-        "in": straight((2, -70), (2, -10)),
-        "out": straight((-2, -10), (-2, -70)),
-        "left": arc((-10, -10), 12, 0, 90),
-        "ahead": straight((2, -10), (2, 10)),
-        "right": arc((10, -10), 8, 180, 90),
-    }
+    # Seen from the south arm, driving north along x = 2.
+    shapes = {"in": straight((2, -70), (2, -10)), "out": straight((-2, -10), (-2, -70))}
+    shapes |= {"ahead": straight((2, -10), (2, 10)), "left": arc((-10, -10), 12, 0, 90)}
+    shapes["right"] = arc((10, -10), 8, 180, 90)
     for k in range(4):
         for name, shape in shapes.items():
             lines[f"{name}{k}"] = turned(shape, 90 * k)
@@ -99,20 +92,14 @@ def roundabout(radius=15.0):
 
 def fork():
     """One lane that splits in two, both of which end."""
-    lines = {
-        "stem": straight((0, 0), (50, 0)),
-        "up": arc((50, 40), 40, -90, -30),
-        "on": straight((50, 0), (120, 0)),
-    }
-    return make_road(lines, [("stem", "up"), ("stem", "on")])
+    lines = {"stem": straight((0, 0), (50, 0)), "on": straight((50, 0), (120, 0))}
+    return make_road(lines | {"up": arc((50, 40), 40, -90, -30)}, [("stem", "up"), ("stem", "on")])
 
 
 def merge():
     """Two lanes that become one."""
-    lines = {
-        "a": straight((0, 0), (50, 0)), "b": straight((10, -20), (50, 0)), "c": straight((50, 0), (150, 0)),
-    }  # fmt: skip
-    return make_road(lines, [("a", "c"), ("b", "c")])
+    lines = {"a": straight((0, 0), (50, 0)), "b": straight((10, -20), (50, 0))}
+    return make_road(lines | {"c": straight((50, 0), (150, 0))}, [("a", "c"), ("b", "c")])
 
 
 def pocket():

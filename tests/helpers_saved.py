@@ -55,18 +55,15 @@ def random_trees(saved: SavedRollouts, branches: int = 4, every: int = 2, seed: 
 
 
 @lru_cache
-def searched(
-    count: int = 2, rollouts: int = 4, branches: int = 6, duration: int = 4
-) -> tuple[About, list[SavedRollouts]]:
+def searched(count=2, rollouts=4, branches=6, duration=4) -> tuple[About, list[SavedRollouts]]:
     """Rollouts of the included agent, leaves of one search each, on the first built-in test segments."""
     agent, store = load_agent(AGENT), SegmentStore(builtin_store("test"))
-    dataset = SceneDataset(
-        store, agent.interactive, agent.dynamics, range(count), routes=True, duration=duration
-    )
+    how: dict[str, Any] = {"routes": True, "duration": duration}
+    dataset = SceneDataset(store, agent.interactive, agent.dynamics, range(count), **how)
     config = EvaluateConfig(search="tree", score="discriminator", rollouts=rollouts, branches=branches)
     scenes = dataset.scenes(range(count))
     found = simulate_batch(agent, scenes, config, keep_tree=True)
-    how: dict[str, Any] = {"goal": found.goal, "search": found.search, "driver": AGENT}
+    how = {"goal": found.goal, "search": found.search, "driver": AGENT}
     segments = [dataset.segment(b).replace(group=store.tags(b)["network"]) for b in range(count)]
     saved = [saved_rollouts(segment, scenes, found.rollouts, b, **how) for b, segment in enumerate(segments)]
     return About.of(AGENT, store, asdict(config)), saved

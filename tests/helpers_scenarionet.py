@@ -24,14 +24,7 @@ def ring(*points: tuple[float, float]) -> Any:
     return FAR + np.array(points, float)
 
 
-def track(
-    x: float,
-    y: float,
-    speed: float,
-    kind: str = "VEHICLE",
-    first: int = 0,
-    size: tuple[float, ...] = (4.5, 2, 1.6),
-) -> dict[str, Any]:
+def track(x: float, y: float, speed: float, kind="VEHICLE", first=0, size=(4.5, 2, 1.6)) -> dict[str, Any]:
     """Somebody at constant speed along +x, seen from a step on."""
     valid = np.arange(STEPS) >= first
     position = np.zeros((STEPS, 3))

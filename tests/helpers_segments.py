@@ -17,12 +17,12 @@ CAR = (4.6, 1.9, 1.6)
 
 
 def make_road(
-    lanes: list[NDArray[Any]],
+    lanes: list[Any],
     successors: Any = (),
     left: Any = (),
     right: Any = (),
-    boundary: list[NDArray[Any]] | None = None,
-    marks: list[NDArray[Any]] | None = None,
+    boundary: Any = (),
+    marks: Any = (),
 ) -> RoadMap:
     """A map of surface streets with lane ids 100, 101, ...; marks are road lines."""
 
@@ -34,18 +34,18 @@ def make_road(
         lane_type=np.full(len(lanes), LaneType.SURFACE_STREET, np.uint8),
         speed_limit=np.full(len(lanes), 14, np.float32),
         lane_width=np.full(len(lanes), LANE_WIDTH, np.float32), successors=pairs(successors),
-        left_neighbors=pairs(left), right_neighbors=pairs(right), boundary=Polylines.of(boundary or []),
-        marks=Polylines.of(marks or []), mark_type=np.full(len(marks or []), MarkType.ROAD_LINE, np.uint8),
+        left_neighbors=pairs(left), right_neighbors=pairs(right), boundary=Polylines.of([*boundary]),
+        marks=Polylines.of([*marks]), mark_type=np.full(len(marks), MarkType.ROAD_LINE, np.uint8),
     )  # fmt: skip
 
 
 def make_segment(
     road: RoadMap,
-    position: NDArray[Any],
-    heading: NDArray[Any],
-    velocity: NDArray[Any],
+    position: Any,
+    heading: Any,
+    velocity: Any,
     dt: float = 0.2,
-    segment_id: str = "made",
+    segment_id="made",
     **changes: Any,
 ) -> RunSegment:
     """Cars that are valid throughout, the first being the ego; any other field by name."""
@@ -111,9 +111,7 @@ def along(path: NDArray[Any], distance: NDArray[Any]) -> tuple[NDArray[Any], NDA
     return at(distance), np.unwrap(np.arctan2(step[..., 1], step[..., 0]))
 
 
-def straight_road(
-    num_agents: int = 3, steps: int = 51, dt: float = 0.2, seed: int = 0, num_lanes: int = 3, **changes: Any
-) -> RunSegment:
+def straight_road(num_agents=3, steps=51, dt=0.2, seed=0, num_lanes=3, **changes: Any) -> RunSegment:
     """Cars at constant speeds (8-15 m/s, one per lane) on a one-way road along +x; nobody touches anybody.
 
     Lane 0 is the rightmost, at y = 0. Agent k drives in lane k modulo ``num_lanes``.
@@ -180,9 +178,7 @@ def crossing_road(arm: float = 120.0) -> RoadMap:
     return make_road(lanes, successors, boundary=edges, marks=marks)
 
 
-def crossing(
-    num_agents: int = 4, steps: int = 51, dt: float = 0.2, seed: int = 0, **changes: Any
-) -> RunSegment:
+def crossing(num_agents=4, steps=51, dt=0.2, seed=0, **changes: Any) -> RunSegment:
     """Cars at 6 m/s that pass a crossing one after the other, 2.5 s apart, each turning as the seed says.
 
     Agent k comes from arm k modulo 4. One light per lane inside the crossing: arms 0 and 2 have green first.
@@ -203,25 +199,14 @@ def crossing(
     state[[*range(3), *range(6, 9)], : max(half - 5, 1)] = schema.SignalState.GO
     state[[*range(3), *range(6, 9)], max(half - 5, 1) : half] = schema.SignalState.CAUTION
     state[[*range(3, 6), *range(9, 12)], half:] = schema.SignalState.GO
-    lights: dict[str, Any] = {
-        "signal_lane": np.arange(8, 20, dtype=np.int32),
-        "signal_point": np.stack([road.lanes[lane][0] for lane in range(8, 20)]),
-        "signal_state": state,
-    }
+    lights = {"signal_lane": np.arange(8, 20, dtype=np.int32), "signal_state": state}
+    lights["signal_point"] = np.stack([road.lanes[lane][0] for lane in range(8, 20)])
     velocity = speed * np.stack([np.cos(heading), np.sin(heading)], -1)
-    name = {"segment_id": f"crossing-{seed}"}
-    return make_segment(road, position, heading, velocity, dt, **{**name, **lights, **changes})
+    more = {"segment_id": f"crossing-{seed}", **lights, **changes}
+    return make_segment(road, position, heading, velocity, dt, **more)
 
 
-def random_segment(
-    segment_id: str = "random",
-    seed: int = 0,
-    agents: int = 3,
-    steps: int = 5,
-    lanes: int = 2,
-    lights: int = 1,
-    marks: int = 2,
-) -> RunSegment:
+def random_segment(segment_id="random", seed=0, agents=3, steps=5, lanes=2, lights=1, marks=2) -> RunSegment:
     """Numbers that fit the schema and mean nothing; tracks have gaps, some limits are unknown."""
     rng = np.random.default_rng(seed)
 
@@ -252,24 +237,17 @@ def random_segment(
         # Within the limits of speed even after smoothing: a metre or two from step to step.
         np.where(valid[..., None], floats(agents, 1, 3) + floats(agents, steps, 3) / 50, 0),
         np.where(valid, floats(agents, steps), 0),
-        np.where(valid[..., None], floats(agents, steps, 2) / 5, 0),
-        float(rng.uniform(0.05, 0.5)),
-        segment_id,
-        source=str(rng.choice(["womd", "commonroad"])),
-        ego=ego,
+        np.where(valid[..., None], floats(agents, steps, 2) / 5, 0), float(rng.uniform(0.05, 0.5)), segment_id,
+        source=str(rng.choice(["womd", "commonroad"])), ego=ego,
         agent_id=rng.permutation(agents).astype(np.int64) - 1,
         agent_type=picks(len(AgentType), agents).astype(np.uint8),
-        size=rng.uniform(0.5, 6, (agents, 3)).astype(np.float32),
-        valid=valid,
-        signal_lane=picks(lanes, lights),
-        signal_point=floats(lights, 3),
+        size=rng.uniform(0.5, 6, (agents, 3)).astype(np.float32), valid=valid,
+        signal_lane=picks(lanes, lights), signal_point=floats(lights, 3),
         signal_state=picks(len(schema.SignalState), lights, steps).astype(np.uint8),
-        origin=rng.normal(0, 1e6, 3),
-        current_step=int(rng.integers(steps)),
-        interest=picks(agents, int(rng.integers(3))),
-        predict=picks(agents, int(rng.integers(3))),
+        origin=rng.normal(0, 1e6, 3), current_step=int(rng.integers(steps)),
+        interest=picks(agents, int(rng.integers(3))), predict=picks(agents, int(rng.integers(3))),
         file=str(rng.choice(["", "kreuzung-ü.xml"])),
-    )
+    )  # fmt: skip
 
 
 def segments(segment_ids: st.SearchStrategy[str] | None = None) -> st.SearchStrategy[RunSegment]:

@@ -21,10 +21,8 @@ KINDS = {
 
 def by_kind(reasons: Iterable[str]) -> Counter[str]:
     """How many tests were skipped for want of what; a reason of no kind stands for itself."""
-    return Counter(
-        next((kind for kind, words in KINDS.items() if re.search(words, reason)), reason)
-        for reason in reasons
-    )
+    found = ([kind for kind, words in KINDS.items() if re.search(words, why)] or [why] for why in reasons)
+    return Counter(kinds[0] for kinds in found)
 
 
 def grown(counts: Counter[str], limits: str) -> list[str]:

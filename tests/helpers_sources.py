@@ -88,12 +88,7 @@ def bound(side: str, points: Iterable[tuple[float, float]], marking: str = "") -
     return f"<{side}Bound>{inner}{f'<lineMarking>{marking}</lineMarking>' if marking else ''}</{side}Bound>"
 
 
-def lanelet(
-    lanelet_id: int,
-    left: Iterable[tuple[float, float]],
-    right: Iterable[tuple[float, float]],
-    inner: str = "",
-) -> str:
+def lanelet(lanelet_id: int, left: Any, right: Any, inner: str = "") -> str:
     """A lanelet; ``inner`` is what follows its bounds."""
     return f'<lanelet id="{lanelet_id}">{bound("left", left)}{bound("right", right)}{inner}</lanelet>'
 
@@ -103,7 +98,7 @@ def exact(tag: str, value: object) -> str:
 
 
 def state(
-    step: int, x: float, y: float, heading: float = 0.0, speed: float | None = 10.0, tag: str = "state"
+    step: int, x: float, y: float, heading: float = 0.0, speed: float | None = 10.0, tag="state"
 ) -> str:
     inner = f"<position><point><x>{x}</x><y>{y}</y></point></position>"
     inner += exact("orientation", heading) + exact("time", step)
@@ -114,12 +109,7 @@ RECTANGLE = "<rectangle><length>4.5</length><width>2.0</width></rectangle>"
 
 
 def obstacle(
-    obstacle_id: int,
-    states: list[str],
-    version: str = "2020a",
-    kind: str = "car",
-    shape: str = RECTANGLE,
-    role: str = "dynamic",
+    obstacle_id: int, states: list[str], version="2020a", kind="car", shape=RECTANGLE, role="dynamic"
 ) -> str:
     """An obstacle in either version's way of writing it; the first of ``states`` is the initial one."""
     first = states[0].replace("<state>", "<initialState>").replace("</state>", "</initialState>")
@@ -130,17 +120,9 @@ def obstacle(
     return f'<{role}Obstacle id="{obstacle_id}">{inner}</{role}Obstacle>'
 
 
-def driver(
-    obstacle_id: int,
-    version: str = "2020a",
-    x: float = 0.0,
-    y: float = 0.0,
-    speed: float = 10.0,
-    steps: range = range(5),
-) -> str:
+def driver(obstacle_id: int, version="2020a", x=0.0, y=0.0, speed=10.0, steps=range(5)) -> str:
     """A car at constant speed along +x, at x at step 0."""
-    states = [state(k, x + speed * 0.1 * k, y, 0.0, speed) for k in steps]
-    return obstacle(obstacle_id, states, version)
+    return obstacle(obstacle_id, [state(k, x + speed * 0.1 * k, y, 0.0, speed) for k in steps], version)
 
 
 ROAD = lanelet(

@@ -23,17 +23,12 @@ def make_record(values: dict[str, float] | None = None, **changes: Any) -> dict[
     counts = [0] * 100 + [3] + [0] * 100
     playback = {"collision_rate_at_states": 0.5, "collision_rate": 0.5, "offroad_time": 0.25, "ade": 0.0}
     return numbers | {
-        "format": 2,
-        "collision_rate_at_states": numbers["collision_rate"],
-        "segments": 4,
-        "run": {"updates": 0, "named": False, "checkpoint": 0},
-        "data": {"name": "test", "checksum": "ab" * 32},
-        "config": CONFIG | changes,
-        "playback": playback,
+        "format": 2, "collision_rate_at_states": numbers["collision_rate"], "segments": 4,
+        "run": {"updates": 0, "named": False, "checkpoint": 0}, "config": CONFIG | changes,
+        "data": {"name": "test", "checksum": "ab" * 32}, "playback": playback, "cost": {"simulation": 6.0},
         "constant_velocity": dict.fromkeys([*METRICS, "collision_rate_at_states"], 2.0),
-        "cost": {"simulation": 6.0},
         "curvature": {"policy": counts, "log": counts},
-    }
+    }  # fmt: skip
 
 
 def make_entry(method: str, seed: int = 0, **values: float) -> Entry:

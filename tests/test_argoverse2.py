@@ -143,23 +143,14 @@ def rename(name: str, to: str) -> Callable[[Columns], None]:
     return change
 
 
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        (put("timestep", 4, 5), "timestep"),  # two states at one step
-        (put("timestep", -1, 5), "timestep"),
-        (put("num_timestamps", 10**12), "num_timestamps"),
-        (put("num_timestamps", 21, 7), "num_timestamps"),
-        (put("end_timestamp", 3.15986559459579e17 + 1e3), "end_timestamp"),
-        (put("start_timestamp", 3.0e17, 2), "start_timestamp"),
-        (put("object_type", "bus", 3), "object_type"),
-        (put("observed", False), "observed"),
-        (put("focal_track_id", "555"), "focal_track_id"),
-        (rename("AV", "300"), "track_id"),
-        (rename("7", "seven"), "track_id"),
-        (rename("7", "0101"), "agent_id"),
-    ],
-)
+@pytest.mark.parametrize(("change", "field"), [
+    (put("timestep", 4, 5), "timestep"),  # two states at one step
+    (put("timestep", -1, 5), "timestep"), (put("num_timestamps", 10**12), "num_timestamps"),
+    (put("num_timestamps", 21, 7), "num_timestamps"), (put("start_timestamp", 3.0e17, 2), "start_timestamp"),
+    (put("end_timestamp", 3.15986559459579e17 + 1e3), "end_timestamp"), (put("observed", False), "observed"),
+    (put("object_type", "bus", 3), "object_type"), (put("focal_track_id", "555"), "focal_track_id"),
+    (rename("AV", "300"), "track_id"), (rename("7", "seven"), "track_id"), (rename("7", "0101"), "agent_id"),
+])  # fmt: skip
 def test_bad_tracks(change: Callable[[Columns], None], field: str, tmp_path: Path) -> None:
     columns = scenario()
     change(columns)

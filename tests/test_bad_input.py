@@ -15,20 +15,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import helpers_sources as sources
 from helpers_convert import FakeReader
-from helpers_sources import (
-    IN_FOLDER,
-    RECTANGLE,
-    ROAD,
-    commonroad,
-    driver,
-    obstacle,
-    read_error,
-    read_one,
-    state,
-    womd_scenario,
-    write_records,
-)
+from helpers_sources import IN_FOLDER, ROAD, commonroad, driver, read_error, womd_scenario, write_records
 from symphony.data import convert as converting
 from symphony.data.convert import convert
 from symphony.data.segment import RunSegment, content_hash, validate
@@ -174,7 +163,7 @@ def test_commonroad_errors_are_named(text: str, field: str, message: str, tmp_pa
     ("<exact>1</exact>", "<intervalStart>1</intervalStart>", NO_OBSTACLE, "obstacle 7"),  # predicted
     ("<x>1.0</x>", "<x>NaN</x>", NO_OBSTACLE, "obstacle 7: position: nan is not finite"),
     ("<velocity><exact>10.0", "<velocity><exact>fast", NO_OBSTACLE, "obstacle 7: velocity: 'fast'"),
-    (RECTANGLE, "", NO_OBSTACLE, "obstacle 7: shape: expected one rectangle"),
+    (sources.RECTANGLE, "", NO_OBSTACLE, "obstacle 7: shape: expected one rectangle"),
     ('Obstacle id="7"', 'Obstacle id="99999999999999999999"', NO_OBSTACLE, "64 bits"),
     ("<x>25</x>", "<x>inf</x>", NO_LANELET, "lanelet 10: bound: inf is not finite"),
     ('ref="11"', 'ref="next"', NO_LANELET, "lanelet 10: successor: 'next' is not an integer"),
@@ -182,15 +171,13 @@ def test_commonroad_errors_are_named(text: str, field: str, message: str, tmp_pa
     ("<duration>3</duration>", "", NO_LIGHT, "trafficLight 30: duration"),
 ])  # fmt: skip
 def test_commonroad_odd_things(old: str, new: str, kind: str, example: str, tmp_path: Path) -> None:
-    light = (
-        '<trafficLight id="30"><cycle><cycleElement><duration>3</duration><color>red</color></cycleElement>'
-        "</cycle></trafficLight>"
-    )
+    cycle = "<cycle><cycleElement><duration>3</duration><color>red</color></cycleElement></cycle>"
     more = ROAD.replace('<predecessor ref="10"/>', '<trafficLightRef ref="30"/>')
+    light = f'<trafficLight id="30">{cycle}</trafficLight>'
     whole = commonroad(more, driver(7), driver(8, x=20), light)
     path = tmp_path / "a.xml"
     path.write_text(whole.replace(old, new, 1))
-    found = read_one("commonroad", path)
+    found = sources.read_one("commonroad", path)
     assert example in found.odd[kind]
     lost = [kind == each for each in (NO_OBSTACLE, NO_LANELET, NO_LIGHT)]
     assert [2 - found.num_agents, 2 - len(found.road.lanes), 1 - len(found.signal_lane)] == lost
@@ -213,10 +200,8 @@ def little_memory(most: float) -> Iterator[None]:
 
 
 def test_many_parked_cars_one_late_state_and_files_beyond_all_measure(tmp_path, monkeypatch):
-    parked, path = (
-        [obstacle(100 + k, [state(0, k, 5)], role="static") for k in range(700)],
-        tmp_path / "a.xml",
-    )
+    path = tmp_path / "a.xml"
+    parked = [sources.obstacle(100 + k, [sources.state(0, k, 5)], role="static") for k in range(700)]
     late = driver(7).replace("<exact>4</exact>", "<exact>9900</exact>", 1)
     path.write_text(commonroad(ROAD, late, driver(8), *parked))
     with little_memory(40e6):

@@ -129,9 +129,7 @@ def test_road_distances_and_flags_are_those_among_all_edges(scenes: SceneBatch) 
 @pytest.mark.parametrize("seed", range(4))
 def test_acute_corners_have_the_side_that_the_distance_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    rings = [
-        np.array([[90, 90], [110, 91], [90, 92], [90, 90]], float)[:: rng.choice([-1, 1])]
-    ]  # the first edge's are acute
+    rings = [np.array([[90.0, 90], [110, 91], [90, 92], [90, 90]])[:: rng.choice([-1, 1])]]  # acute first
     for centre in rng.uniform(-80, 80, (12, 2)):
         angle = np.sort(rng.uniform(0, 2 * np.pi, 7)) + np.linspace(0, 0.1, 7)
         ring = centre + rng.uniform(1, 20, (7, 1)) * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -179,32 +177,22 @@ def test_padding_batch_and_order_change_nothing(scenes: SceneBatch) -> None:
         assert torch.equal(road_distance(lone, zero, where[mine].flip(1), alone).flip(1), distance[mine])
 
 
-def test_answers_stay_when_cells_get_their_lists(scenes: SceneBatch) -> None:
-    row, where = places(scenes, 6, seed=5)
-    tables, seen, lists = Tables(scenes, FEW), [], []
+def answers(scenes: SceneBatch, tables: Tables, at: tuple[torch.Tensor, torch.Tensor]) -> list[torch.Tensor]:
+    flat, _ = nearest_points(tables, *at)
+    return [flat, *(ask(scenes, *at, tables) for ask in (road_distance, offroad_flags))]
+
+
+def test_answers_stay_when_cells_get_their_lists_and_threads_ask_at_once(scenes: SceneBatch) -> None:
+    asked, tables, lists = [places(scenes, 6, seed=seed) for seed in range(12)], Tables(scenes, FEW), []
+    first = [answers(scenes, Tables(scenes, FEW), at) for at in asked]
     for _ in range(3):
-        flat, _ = nearest_points(tables, row, where)
+        assert all(map(torch.equal, answers(scenes, tables, asked[5]), first[5]))
         lists.append((tables.point_cells.begin >= 0).sum())
-        seen.append(
-            (flat, road_distance(scenes, row, where, tables), offroad_flags(scenes, row, where, tables))
-        )
     assert lists[0] < lists[1] == lists[2]
-    for flat, distance, flag in seen[1:]:
-        assert torch.equal(flat, seen[0][0])
-        assert torch.equal(distance, seen[0][1])
-        assert torch.equal(flag, seen[0][2])
-
-
-def test_threads_that_ask_at_once_get_the_same(scenes: SceneBatch) -> None:
-    tables, asked = Tables(scenes, FEW), [places(scenes, 6, seed=seed) for seed in range(12)]
+    fresh = Tables(scenes, FEW)
     with ThreadPoolExecutor(6) as pool:
-        found = list(
-            pool.map(lambda at: (nearest_points(tables, *at), road_distance(scenes, *at, tables)), asked)
-        )
-    for at, ((flat, _), distance) in zip(asked, found, strict=True):
-        alone = Tables(scenes, FEW)
-        assert torch.equal(flat, nearest_points(alone, *at)[0])
-        assert torch.equal(distance, road_distance(scenes, *at, alone))
+        for one, other in zip(pool.map(lambda at: answers(scenes, fresh, at), asked), first, strict=True):
+            assert all(map(torch.equal, one, other))
 
 
 def test_collisions_are_those_of_all_pairs() -> None:
@@ -341,11 +329,8 @@ def test_an_overpass_is_another_world(slope: float, turn: float) -> None:
     np.testing.assert_allclose(road[:, 0], -LANE_WIDTH / 2, atol=1e-3)
 
 
-def test_data_and_geometry_agree_on_what_a_level_is() -> None:
-    assert levels.LEVEL == LEVEL
-
-
 def test_at_one_height_all_of_it_counts() -> None:
+    assert levels.LEVEL == LEVEL  # of data and of geometry
     for height in (0.0, LEVEL - 0.1):
         env, found = drive(overpass(height))
         assert found.get(keys.COLLISION)[0, :2].all()
@@ -360,10 +345,8 @@ def test_at_one_height_all_of_it_counts() -> None:
 def test_an_evaluation_holds_to_it(agent: str, tmp_path: Path) -> None:
     """Of two segments, one with a bridge, half collide, and nobody is off the road but where both roads are one."""
     fill(tmp_path / "store", [overpass(0.0), overpass(HIGH)])
-    rates = [
-        evaluate(agent, tmp_path / "store", EvaluateConfig(rollouts=2), items=items).numbers()
-        for items in ([0], [1], [0, 1])
-    ]
+    how = EvaluateConfig(rollouts=2)
+    rates = [evaluate(agent, tmp_path / "store", how, items=items).numbers() for items in ([0], [1], [0, 1])]
     for name in ("collision_rate", "collision_rate_at_states", "collision_crossing"):
         assert [one[name] for one in rates] == [100.0, 0.0, 50.0]
     assert rates[0]["offroad_time"] > 0
@@ -393,12 +376,9 @@ def test_flat_scenes_beside_it_keep_every_number() -> None:
     one, two = (env.start(torch.arange(2)) for env in (alone, mixed))
     for _ in range(5):
         for name in one.keys(True, True):
-            mine, theirs = one.get(name), two.get(name)
-            assert torch.equal(mine, theirs), name
-        action = torch.full((2, 2), 3)
-        one, two = (
-            env.step(now.set(keys.ACTION, action))["next"] for env, now in ((alone, one), (mixed, two))
-        )
+            assert torch.equal(one.get(name), two.get(name)), name
+        one, two = (now.set(keys.ACTION, torch.full((2, 2), 3)) for now in (one, two))
+        one, two = alone.step(one)["next"], mixed.step(two)["next"]
 
 
 def test_cars_that_follow_each_other_up_a_ramp_are_never_apart() -> None:
@@ -408,15 +388,8 @@ def test_cars_that_follow_each_other_up_a_ramp_are_never_apart() -> None:
     below = np.concatenate([line(1, 40, 0), line(1, -80, HIGH)])
     levels = Levels(np.concatenate([ramp, lower, upper, below, line(0, 0, 0), line(1, 0, HIGH)]))
     assert not levels.flat
-    place = np.stack(
-        [
-            np.linspace(-60, 60, 121),
-            np.full(121, 20.0),
-            np.interp(np.linspace(-60, 60, 121), [-60, 0], [0, HIGH]),
-        ],
-        -1,
-    )
-    found = levels.at(place)
+    x = np.linspace(-60, 60, 121)
+    found = levels.at(np.stack([x, np.full(121, 20.0), np.interp(x, [-60, 0], [0, HIGH])], -1))
     one, other = torch.from_numpy(found[1:]), torch.from_numpy(found[:-1])
     assert (one[:, 1] != other[:, 1]).any()
     assert not levels_apart(one, other).any()

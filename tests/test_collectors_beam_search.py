@@ -22,10 +22,8 @@ def no_gradients():
 
 
 def search(start, *, env=None, policy=None, score=distance, steps=12, prune_every=4, **kwargs):
-    how = {"slot_keys": [STREAM], **kwargs}
-    return collectors.beam_search(
-        env or Walk(), policy or Policy(), score, start, steps=steps, prune_every=prune_every, **how
-    )
+    how = {"slot_keys": [STREAM], "steps": steps, "prune_every": prune_every, **kwargs}
+    return collectors.beam_search(env or Walk(), policy or Policy(), score, start, **how)
 
 
 def test_one_branch_is_a_plain_rollout():
@@ -92,11 +90,8 @@ def test_rows_never_meet():
         alone = search(start.reshape(6, 4)[row])
         assert_same(alone.trajectories, flat.trajectories[row])
         assert_close(alone.scores, flat.scores[row], rtol=0, atol=0)
-    rows = Walk().reset(TensorDict({}, [3]))  # views of one row will do for a start
-    assert_same(
-        search(collectors.branch(rows, 4)).trajectories,
-        search(collectors.branch(rows, 4).clone()).trajectories,
-    )
+    views = collectors.branch(Walk().reset(TensorDict({}, [3])), 4)  # of one row will do for a start
+    assert_same(search(views).trajectories, search(views.clone()).trajectories)
 
 
 def test_copies_draw_numbers_of_their_slot():
@@ -141,9 +136,8 @@ class Drawing(Walk):
 ])  # fmt: skip
 def test_what_remembers_can_not_be_branched(env, why):
     start = starts(Walk(), 2, branches=4).set("step_count", torch.zeros(2, 4, 1, dtype=torch.int64))
-    with pytest.raises(
-        ValueError, match=f"can't be branched: it .*{why}.* GymEnv, VmasEnv, SerialEnv and Para"
-    ):
+    message = f"can't be branched: it .*{why}.* GymEnv, VmasEnv, SerialEnv and Para"
+    with pytest.raises(ValueError, match=message):
         search(start, env=env())
 
 
@@ -171,9 +165,8 @@ def test_marks_of_the_tree():
     for row, leaf, step in itertools.product(range(3), range(4), range(12)):
         slot = found.slots[row, step // 4, leaf]
         assert_same(found.tree[row, slot, step], found.trajectories[row, leaf, step])
-    assert_close(
-        found.leaf_totals, collectors.max_then_sum(found.scores.unflatten(2, (3, 4)).transpose(1, 2))
-    )
+    scores = found.scores.unflatten(2, (3, 4)).transpose(1, 2)
+    assert_close(found.leaf_totals, collectors.max_then_sum(scores))
 
 
 def test_leaves_are_the_best_and_distinct():
@@ -183,10 +176,7 @@ def test_leaves_are_the_best_and_distinct():
     assert_same(best.trajectories, whole.trajectories[:, :4])
     assert_close(best.slots, whole.slots[..., :4])
     assert_close(best.scores, whole.scores[:, :4])
-    free, chosen = (
-        search(start, rule=collectors.KeepAll()),
-        search(start, rule=collectors.KeepAll(), leaves=6),
-    )
+    free, chosen = (search(start, rule=collectors.KeepAll(), leaves=leaves) for leaves in (None, 6))
     assert torch.equal(chosen.slots[:, 0], free.totals[:, -1].argsort(-1))
 
 
@@ -195,9 +185,8 @@ def test_a_rule_may_mix_groups():
     generator, key = torch.Generator().manual_seed(0), ("agents", "goal")
     goals = torch.randint(3, (3, 6, 2), generator=generator)
     start = starts(Walk(), 3, branches=6).set(key, goals)
-    found = search(
-        start, rule=collectors.ReplaceBad(2.0), group_key=key, noise=torch.rand(3, 3, generator=generator)
-    )
+    noise = torch.rand(3, 3, generator=generator)
+    found = search(start, rule=collectors.ReplaceBad(2.0), group_key=key, noise=noise)
     groups, mixed = goals, 0
     for parents, totals in zip(found.parents.unbind(1), found.totals.unbind(1), strict=True):
         after = groups.gather(1, parents[..., None].expand(3, 6, 2))
@@ -242,9 +231,8 @@ def test_scores_of_any_usual_shape_become_one_number_per_agent():
     """Of three branches: without agents, with one or two, and with a last dimension as TorchRL's rewards have it."""
     for shape in ((3,), (3, 1), (3, 2), (3, 1, 1), (3, 2, 1)):
         values = torch.rand(5, *shape)
-        assert torch.equal(
-            collectors.KeyScore("score")(TensorDict({"score": values}, [5, 3])), values.reshape(5, 3, -1)
-        )
+        found = collectors.KeyScore("score")(TensorDict({"score": values}, [5, 3]))
+        assert torch.equal(found, values.reshape(5, 3, -1))
     td = TensorDict({"score": torch.tensor([[1.0, torch.nan]]), "valid": torch.tensor([[True, False]])}, [1])
     assert collectors.KeyScore("score", valid_key="valid")(td).tolist() == [[1.0, 0.0]]
     with pytest.raises(KeyError, match="absent"):

@@ -35,9 +35,8 @@ def make_env(last=1000):
 
 def make(env=make_env, policy=None, **kwargs):
     how = {"score": distance, "frames_per_batch": FRAMES, **SEARCH, **kwargs}
-    return BeamSearchCollector(
-        env, policy or Policy(), **{"total_frames": 3 * how["frames_per_batch"], **how}
-    )
+    how = {"total_frames": 3 * how["frames_per_batch"], **how}
+    return BeamSearchCollector(env, policy or Policy(), **how)
 
 
 def test_best_leaf_and_its_search():
@@ -136,15 +135,11 @@ def test_random_actions(options):
 
 
 def test_what_can_not_be_right_is_an_error():
-    for options, message in (
-        ({"keep_tree": True}, "keep_tree needs all"),
-        ({"leaves": 0}, "leaves must be 1 ... 4"),
-        ({"leaves": 5}, "leaves must be 1 ... 4"),
-        ({"split_trajs": True}, "split_trajs"),
-        ({"extend_buffer": False}, "extend_buffer"),
-    ):
+    wrong = [("keep_tree", True, "keep_tree needs all"), ("split_trajs", True, "split_trajs")]
+    wrong += [("leaves", count, "leaves must be 1 ... 4") for count in (0, 5)]
+    for name, value, message in (*wrong, ("extend_buffer", False, "extend_buffer")):
         with pytest.raises(ValueError, match=message):
-            make(**options)
+            make(**{name: value})
     with pytest.raises(TypeError, match="unknown"):
         make(unknown=3)
 
@@ -254,12 +249,11 @@ def test_two_workers_fill_a_replay_buffer_with_data_of_their_own():
 def test_workers_that_nobody_seeded_draw_apart():
     how = {"score": KeyScore("reward", negate=True), "branches": 4, "rule": Systematic(1.0)}
     collectors, pendulums = [], lambda: with_rows(PendulumEnv(), [ROWS])
+    how["frames_per_batch"] = FRAMES
     for worker in range(2):
         with torch.random.fork_rng([]):
             torch.manual_seed(0)
-            collectors.append(
-                BeamSearchCollector(pendulums, frames_per_batch=FRAMES, worker_idx=worker, **how)
-            )
+            collectors.append(BeamSearchCollector(pendulums, worker_idx=worker, **how))
     start = TensorDict(batch_size=[ROWS, 4])
     assert not torch.equal(*(collector.rule_noise(start) for collector in collectors))
     firsts = [collector.next() for collector in collectors]

@@ -187,10 +187,8 @@ def test_without_pruning_it_is_the_best_of_all_branches(valued):
         return 3.0 * place[..., :1]
 
     network = TensorDictModule(worth, ["place"], ["state_value"]) if valued else None
-    how = {
-        "policy": hashed, "value_network": network, "rule": KeepAll(), "prune_every": 2, "temperature": 0.5,
-    }  # fmt: skip
-    planner = BeamSearchPlanner(env, HORIZON, BRANCHES, **how)
+    how = {"policy": hashed, "value_network": network, "rule": KeepAll(), "prune_every": 2}
+    planner = BeamSearchPlanner(env, HORIZON, BRANCHES, temperature=0.5, **how)
     planned = planner(start.clone())
     expected, actions = returns(env, start, worth if valued else None)
     best = expected.argmax(-1)

@@ -30,9 +30,8 @@ class Filtered(EnvBase):
 
     def __init__(self) -> None:
         super().__init__(batch_size=[])
-        self.observation_spec = Composite(
-            x=Unbounded((1,)), t=Unbounded((1,), dtype=torch.int64), y=Unbounded((STEPS,))
-        )
+        time = Unbounded((1,), dtype=torch.int64)
+        self.observation_spec = Composite(x=Unbounded((1,)), t=time, y=Unbounded((STEPS,)))
         self.state_spec, self.action_spec = self.observation_spec.clone(), Unbounded((1,))
         self.reward_spec = Unbounded((1,))
 
@@ -66,10 +65,8 @@ def observed(rows: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def filtered(y: Tensor, rule: Any, branches: int, **how: Any) -> collectors.BeamSearchResult:
-    rows = len(y)
-    start = TensorDict(
-        {"x": torch.zeros(rows, 1), "t": torch.zeros(rows, 1, dtype=torch.int64), "y": y}, [rows]
-    )
+    rows, zero = len(y), torch.zeros(len(y), 1)
+    start = TensorDict({"x": zero, "t": zero.long(), "y": y}, [rows])
     noise = torch.rand(rows, STEPS, *([branches] if rule.noise_per_slot else []))
     how |= {"steps": STEPS, "prune_every": 1, "keep": [("next", "x")], "aggregate": TOTAL}
 
@@ -122,15 +119,12 @@ def test_a_value_looks_ahead_without_a_bias():
     assert abs(float(ratio.mean()) - 1) < 4 * float(ratio.std()) / math.sqrt(len(ratio))
 
 
-@pytest.mark.parametrize(
-    ("rule", "weighs"), [(collectors.Stratified(threshold=0.5), True), (collectors.KeepBest(), False)]
-)
-def test_weights_are_in_the_batch(rule, weighs):
-    how = {"branches": 4, "leaves": 4, "prune_every": 3, "aggregate": collectors.Aggregate("sum")}
-    score = collectors.KeyScore("reward", negate=True)
-    collector = collectors.BeamSearchCollector(
-        collectors.with_rows(Mass(), [3]), score=score, rule=rule, frames_per_batch=96, **how
-    )
+@pytest.mark.parametrize("rule", [collectors.Stratified(threshold=0.5), collectors.KeepBest()], ids=repr)
+def test_weights_are_in_the_batch(rule):
+    how = {"branches": 4, "leaves": 4, "prune_every": 3, "aggregate": TOTAL, "frames_per_batch": 96}
+    score, weighs = collectors.KeyScore("reward", negate=True), isinstance(rule, collectors.Stratified)
+    env = collectors.with_rows(Mass(), [3])
+    collector = collectors.BeamSearchCollector(env, score=score, rule=rule, **how)
     fake, batch = collector.fake_tensordict(), collector.next()
     key = ("collector", "log_weight")
     assert (key in batch.keys(True, True)) == (key in fake.keys(True, True)) == weighs
@@ -203,10 +197,8 @@ def test_copies_are_proportional(totals, noise, temperature):
     """A branch of weight w gets as many copies of S w as its scheme promises; the best that goes on is in slot 0."""
     given_totals = torch.tensor([totals])
     for scheme in SCHEMES:
-        numbers = torch.tensor(
-            [noise[: len(totals)]] if scheme is collectors.Stratified else noise[:1]
-        ).double()
-        parents = scheme(temperature)(given_totals, numbers)[0]
+        numbers = [noise[: len(totals)]] if scheme is collectors.Stratified else noise[:1]
+        parents = scheme(temperature)(given_totals, torch.tensor(numbers).double())[0]
         counts = torch.bincount(parents, minlength=len(totals))
         assert len(counts) == len(totals)
         if all(map(math.isfinite, totals)):
@@ -252,16 +244,12 @@ def replaced(totals, threshold, noise, groups):
     return parents
 
 
-@st.composite
-def some_branches(draw):
-    number = draw(st.integers(1, 12))
-    totals = draw(st.lists(ODD, min_size=number, max_size=number))
-    return totals, draw(st.lists(st.integers(-2, 2), min_size=number, max_size=number))
+BRANCHES = st.lists(st.tuples(ODD, st.integers(-2, 2)), min_size=1, max_size=12)
 
 
-@given(some_branches(), ODD.filter(lambda x: not math.isnan(x)), NOISE, st.booleans())
+@given(BRANCHES, ODD.filter(lambda x: not math.isnan(x)), NOISE, st.booleans())
 def test_replace_bad_by_hand(branches, threshold, noise, grouped):
-    totals, groups = branches
+    totals, groups = map(list, zip(*branches, strict=True))
     totals, threshold = torch.tensor([totals]), float(torch.tensor(threshold))
     given_groups = torch.tensor([groups]) if grouped else None
     numbers = torch.tensor([noise], dtype=torch.float64)

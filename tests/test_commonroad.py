@@ -61,17 +61,14 @@ def test_a_missing_velocity_is_the_slope_of_the_positions(path: Path) -> None:
 
 
 POLYGON = "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in [(0, 0), (3, 0), (3, 1), (0, 1)])
-TURNED = (
-    "<rectangle><length>4</length><width>2</width><orientation>0.5</orientation>"
-    "<center><x>1</x><y>0.2</y></center></rectangle>"
-)
+TURNED = "<length>4</length><width>2</width><orientation>0.5</orientation><center><x>1</x><y>0.2</y></center>"
 
 
 @pytest.mark.parametrize(("shape", "size", "place", "turn"), [
     (RECTANGLE, (4.5, 2), (0, 0), 0),
     ("<circle><radius>0.4</radius></circle>", (0.8, 0.8), (0, 0), 0),
     (f"<polygon>{POLYGON}</polygon>", (3, 1), (1.5, 0.5), 0),
-    (TURNED, (4, 2), (1, 0.2), 0.5),
+    (f"<rectangle>{TURNED}</rectangle>", (4, 2), (1, 0.2), 0.5),
 ])  # fmt: skip
 def test_boxes_bound_their_shape(path, shape, size, place, turn):
     heading = 0.7
@@ -220,10 +217,8 @@ CYCLE = "".join(
 )
 APPROACH = '<successor ref="11"/><successor ref="12"/><trafficLightRef ref="30"/>'
 FORK = lanelet(10, [(0, 2), (50, 2)], [(0, -2), (50, -2)], APPROACH)
-FORK += "".join(
-    lanelet(target, [(50, 2), (100, 2 + dy)], [(50, -2), (100, -2 + dy)])
-    for target, dy in ((11, 0), (12, 30))
-)
+for target, dy in ((11, 0), (12, 30)):
+    FORK += lanelet(target, [(50, 2), (100, 2 + dy)], [(50, -2), (100, -2 + dy)])
 TURNS = (
     '<intersection id="40"><incoming id="41"><incomingLanelet ref="10"/>'
     '<successorsStraight ref="11"/><successorsLeft ref="12"/></incoming></intersection>'

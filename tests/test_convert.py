@@ -187,16 +187,14 @@ def test_a_merge_that_was_killed_is_begun_anew(tmp_path: Path) -> None:
     assert not (tmp_path / "all.merging").exists()
 
 
-def test_a_conversion_to_the_same_name_is_left_alone(tmp_path: Path) -> None:
-    logs = [tmp_path / name for name in ("a.scene", "b.scene")]
-    logs[0].write_text("straight 1")
-    logs[1].write_text("interrupt")
+def test_a_conversion_to_the_same_name_is_left_alone(logs: Write, tmp_path: Path) -> None:
+    files = [logs("a.scene", "straight 1"), logs("b.scene", "interrupt")]
     with pytest.raises(KeyboardInterrupt):
-        convert(FakeReader(), logs, tmp_path / "mine")
-    begun = {path: path.read_bytes() for path in (tmp_path / "mine.partial").rglob("*") if path.is_file()}
+        convert(FakeReader(), files, tmp_path / "mine")
+    begun = content(tmp_path / "mine.partial")
     with pytest.raises(DataError, match="unfinished conversion to that name"):
         merge(PARTS[1:], tmp_path / "mine")
-    assert {path: path.read_bytes() for path in begun} == begun
+    assert content(tmp_path / "mine.partial") == begun
 
 
 def test_the_report_of_a_merged_store_joins_those_of_its_parts(tmp_path: Path) -> None:
@@ -253,10 +251,8 @@ def test_what_stays_is_what_it_was(radius: float, seed: int) -> None:
         else:
             assert away > radius - 1
     for old, new, name in ((segment.road, found.road, n) for n in ("successors", "left_neighbors")):
-        kept = {
-            (a, b) for a, b in old.lane_id[getattr(old, name)].tolist() if {a, b} <= set(new.lane_id.tolist())
-        }
-        assert {(a, b) for a, b in new.lane_id[getattr(new, name)].tolist()} == kept
+        before, after = (set(map(tuple, r.lane_id[getattr(r, name)].tolist())) for r in (old, new))
+        assert after == {pair for pair in before if {*pair} <= set(new.lane_id.tolist())}
     light = dict(zip(segment.road.lane_id[segment.signal_lane], segment.signal_state.tolist(), strict=True))
     for lane, states in zip(found.road.lane_id[found.signal_lane], found.signal_state.tolist(), strict=True):
         assert light[lane] == states

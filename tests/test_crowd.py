@@ -45,9 +45,8 @@ def row(cars, steps=31, name="row"):
     x, xs = start + speed * DT * np.arange(steps), np.arange(0.0, END + 1, 2.0)
     lines = [np.stack([xs, np.full_like(xs, k * LANE_WIDTH)], -1) for k in range(3)]
     pairs = np.array([[0, 1], [1, 2]])
-    position, velocity = (
-        np.stack(each, -1) for each in ((x, lane * LANE_WIDTH + 0 * x), (speed + 0 * x, 0 * x))
-    )
+    parts = (x, lane * LANE_WIDTH + 0 * x), (speed + 0 * x, 0 * x)
+    position, velocity = (np.stack(each, -1) for each in parts)
     road = make_road(lines, left=pairs, right=pairs[:, ::-1])
     found = make_segment(road, position, 0 * x, velocity, segment_id=name)
     for a, there in enumerate((x >= 0) & (x <= END)):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -62,10 +62,7 @@ def test_simulations(space):
         policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
         start = start_states(env, agent.goals, trees=2, branches=1, seed=0)
         simulate(env, policy, start)  # makes constants
-        if device == CUDA:
-            with never_waiting():
-                found.append(simulate(env, policy, start).state)
-        else:
+        with never_waiting() if device == CUDA else nullcontext():
             found.append(simulate(env, policy, start).state)
     here, there, again = (state.cpu() for state in found)
     assert torch.equal(there, again)
@@ -84,9 +81,8 @@ def test_searches(rule):
     assert torch.equal(there.trajectories[keys.STATE], again.trajectories[keys.STATE])
     assert here.trajectories.shape == there.trajectories.shape == (2, 1, 3, LOGGED - 1)
     torch.testing.assert_close(there.totals.cpu(), here.totals, atol=1e-3, rtol=0)
-    torch.testing.assert_close(
-        there.trajectories[keys.STATE].cpu(), here.trajectories[keys.STATE], atol=1e-3, rtol=0
-    )
+    states = [found.trajectories[keys.STATE].cpu() for found in (there, here)]
+    torch.testing.assert_close(*states, atol=1e-3, rtol=0)
 
 
 def loss_and_gradients(name: str, space: str, device: str) -> tuple[TensorDict, dict[str, torch.Tensor]]:

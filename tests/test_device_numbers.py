@@ -120,9 +120,8 @@ def test_a_device_finds_the_same(monkeypatch):
 @torch.no_grad()
 def test_an_environment_is_compiled_where_it_is_and_its_copies_are_not():
     torch.compiler.reset()
-    env = DrivingEnv(
-        collate([scene(straight_road(), [0, 1])]), Displacement(), ObservationConfig.nothing(), seed=0
-    )
+    scenes = collate([scene(straight_road(), [0, 1])])
+    env = DrivingEnv(scenes, Displacement(), ObservationConfig.nothing(), seed=0)
     plain = env.rollout(4)
     calls = []
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import importlib.util
 import inspect
 import io
 import json
@@ -25,16 +24,10 @@ from helpers_processes import output_of
 from helpers_store import brief
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = (
-    "README.md",
-    "CONTRIBUTING.md",
-    "recipes/README.md",
-    *sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md")),
-)
-FENCE = re.compile(
-    r"^(?:<!-- not run: (?P<reason>[^\n]+) -->\n)?```(?P<kind>\w+)(?P<more>[^\n]*)\n(?P<text>.*?)^```$",
-    re.M | re.S,
-)
+DOCS = sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md"))
+PAGES = ("README.md", "CONTRIBUTING.md", "recipes/README.md", *DOCS)
+WHY = r"^(?:<!-- not run: (?P<reason>[^\n]+) -->\n)?"
+FENCE = re.compile(WHY + r"```(?P<kind>\w+)(?P<more>[^\n]*)\n(?P<text>.*?)^```$", re.M | re.S)
 """A block of code; a comment before it says why it is not run, and `title="FILE"` that it is a file."""
 
 
@@ -149,11 +142,6 @@ def test_nothing_tells_to_install_another_project() -> None:
         assert found is None, f"{file.relative_to(ROOT)}: {found and found[0]}"
 
 
-needs_mkdocs = pytest.mark.skipif(
-    importlib.util.find_spec("mkdocs") is None, reason="mkdocs is not installed (the extra [docs])"
-)
-
-
 def _built(out: str) -> int:
     """Build the pages; the package, which a hook looks at, is imported here already."""
     os.chdir(ROOT)
@@ -166,12 +154,12 @@ def _built(out: str) -> int:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("mkdocs", reason="mkdocs is not installed (the extra [docs])")
     out = tmp_path_factory.mktemp("site")
     output_of(_built, str(out), said=tmp_path_factory.mktemp("said") / "said")
     return out
 
 
-@needs_mkdocs
 def test_every_public_name_is_in_the_reference(site: Path) -> None:
     missing = set()
     for package in sorted((ROOT / "src" / "symphony").glob("*/__init__.py")):
@@ -187,7 +175,6 @@ def test_every_public_name_is_in_the_reference(site: Path) -> None:
     assert missing == set()
 
 
-@needs_mkdocs
 def test_docstrings_are_markdown_in_the_reference(site: Path) -> None:
     pages = "".join(page.read_text(encoding="utf-8") for page in (site / "reference").glob("*.html"))
     prose = re.sub(r'<span class="sd">.*?</span>', "", pages)  # without the sources that are shown

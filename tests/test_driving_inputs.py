@@ -39,19 +39,13 @@ def scene(seed: int, others: int = 6) -> tuple[Any, ...]:
     points = (step.cumsum(0) - step[:1])[None, None]
     # Not at the route's beginning, so that there is something behind.
     own = torch.cat([points[0, 0, 8], turn[8:9], 20 * torch.rand(2, generator=rng, dtype=torch.float64)])
-    place = points[0, 0, :: POINTS // others][:others] + 4 * torch.randn(
-        others, 2, generator=rng, dtype=torch.float64
-    )
+    place = 4 * torch.randn(others, 2, generator=rng, dtype=torch.float64)
+    place += points[0, 0, :: POINTS // others][:others]
     motion = 10 * torch.randn(others, 3, generator=rng, dtype=torch.float64)
     size = torch.tensor([4.5, 2.0], dtype=torch.float64)
-    exists = torch.ones(1, 1, POINTS, dtype=torch.bool)
-    return (
-        own[None, None],
-        size[None, None],
-        torch.cat([place, motion], -1)[None, None],
-        size.expand(1, 1, others, 2),
-        RouteWindow(points, exists, torch.tensor([[8]])),
-    )
+    route = RouteWindow(points, torch.ones(1, 1, POINTS, dtype=torch.bool), torch.tensor([[8]]))
+    state = torch.cat([place, motion], -1)
+    return own[None, None], size[None, None], state[None, None], size.expand(1, 1, others, 2), route
 
 
 def moved(parts: tuple[Any, ...], angle: float, shift: Tensor) -> tuple[Any, ...]:
@@ -99,13 +93,9 @@ def test_on_a_straight_route_it_is_what_can_be_computed_by_hand() -> None:
         dtype=torch.float64,
     )
     size = torch.tensor([4.0, 2.0], dtype=torch.float64)
-    found = along_route(
-        own,
-        size[None, None],
-        others[None, None],
-        size.expand(1, 1, 5, 2),
-        RouteWindow(points[None, None], torch.ones(1, 1, POINTS, dtype=torch.bool), torch.tensor([[3]])),
-    )[0, 0]
+    exists = torch.ones(1, 1, POINTS, dtype=torch.bool)
+    route = RouteWindow(points[None, None], exists, torch.tensor([[3]]))
+    found = along_route(own, size[None, None], others[None, None], size.expand(1, 1, 5, 2), route)[0, 0]
     gap, left, faster = (20.0 - 4.0, -6.0 + 4.0, 0.0), (0.0, -3.5, 3.0), (-6.0, 2.0, 0.0)
     brake = 36.0 / (2 * 16.0)
     for k in range(3):
@@ -155,9 +145,8 @@ def data() -> SceneDataset:
     return SceneDataset(SegmentStore(builtin_store("train")), 2, Bicycle(), routes=True)
 
 
-EVERYTHING = ObservationConfig(
-    num_points=64, num_lights=3, route=True, along=True, gaps=True, foresight=(0.5, 1.0)
-)
+MANY = ObservationConfig(num_points=64, num_lights=3)
+EVERYTHING = replace(MANY, route=True, along=True, gaps=True, foresight=(0.5, 1.0))
 
 
 def test_lights_seen_are_the_nearest_of_all(data: SceneDataset) -> None:

@@ -104,9 +104,8 @@ raise SystemExit(cli.main(["data", "verify", "x"]))
 
 
 def test_a_terminated_command_says_so():
-    process = subprocess.Popen(
-        [sys.executable, "-c", SLOW], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([sys.executable, "-c", SLOW], **pipes)
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
     process.terminate()

@@ -16,9 +16,8 @@ from torchrl.envs.transforms import BatchSizeTransform
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 from torchrl.modules import AdditiveGaussianModule
 
-from helpers_segments import crossing, straight_road
+from helpers_segments import crossing, straight_road, turned
 from symphony import DrivingEnv, ObservationConfig, keys
-from symphony.data.segment import Polylines, RunSegment
 from symphony.envs import Bicycle, ConstantVelocity, Displacement, collate, scene
 from symphony.envs import flags as module
 from symphony.envs.flags import collision_flags
@@ -45,8 +44,7 @@ def actions(env: DrivingEnv, shape: tuple[int, ...], seed: int = 0) -> torch.Ten
 
 def run(env: DrivingEnv, start: TensorDict, plan: torch.Tensor) -> TensorDict:
     """Apply actions [..., T, N(, 2)] and stack what follows along a last dimension T."""
-    out, now = [], start
-    time = start.ndim
+    out, now, time = [], start, start.ndim
     for action in plan.unbind(time):
         now = env.step(now.clone(False).set(keys.ACTION, action))["next"]
         out.append(now)
@@ -123,30 +121,11 @@ def test_partial_reset_keeps_the_rest():
     assert (fresh[1:] == state[1:].select(*fresh.keys(True, True))).all()
 
 
-def moved(segment: RunSegment, angle: float, x: float, y: float) -> RunSegment:
-    """The whole world turned about the origin, then shifted."""
-    c, s = math.cos(angle), math.sin(angle)
-    turn = torch.tensor([[c, s, 0], [-s, c, 0], [0, 0, 1]], dtype=torch.float64).numpy()
-    shift = [x, y, 0.0]
-
-    def lines(value: Polylines) -> Polylines:
-        return Polylines((value.points @ turn + shift).astype("float32"), value.offsets)
-
-    road = segment.road
-    return segment.replace(
-        position=(segment.position @ turn + shift).astype("float32"),
-        heading=segment.heading + angle,
-        velocity=(segment.velocity @ turn[:2, :2]).astype("float32"),
-        signal_point=(segment.signal_point @ turn + shift).astype("float32"),
-        road=replace(road, **{name: lines(getattr(road, name)) for name in ("lanes", "boundary", "marks")}),
-    )
-
-
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
 def test_moving_the_world_changes_nothing_an_agent_sees(dynamics):
     segment = crossing(6)
     here = make_env(segment, dynamics=dynamics, config=ALL)
-    there = make_env(moved(segment, 2.1, 310.0, -95.0), dynamics=dynamics, config=ALL)
+    there = make_env(turned(segment, 2.1, (310.0, -95.0)), dynamics=dynamics, config=ALL)
     plan = actions(here, (1, 15))
     a, b = (run(e, e.start(torch.tensor([0])), plan) for e in (here, there))
     for key in (keys.OWN, keys.COLLISION, keys.OFFROAD, keys.REWARD):

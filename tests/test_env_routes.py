@@ -14,21 +14,10 @@ from numpy.typing import NDArray
 
 from helpers_segments import CAR, crossing, make_road, straight_road
 from symphony import DrivingEnv, ObservationConfig, keys
-from symphony.data.segment import RunSegment
 from symphony.envs import CHOICE_FEATURES, ROUTE_FEATURES, Bicycle, Displacement, collate, scene
+from symphony.envs import routes as module
 from symphony.envs.objects import Objects, entering
-from symphony.envs.routes import (
-    AHEAD,
-    POINTS,
-    SPACING,
-    TURN_FEATURES,
-    FollowedRoutes,
-    Routes,
-    RouteWindow,
-    route_ahead,
-    route_choices,
-    route_table,
-)
+from symphony.envs.routes import POINTS, SPACING, FollowedRoutes, route_ahead, route_choices, route_table
 from symphony.envs.scene import leaving
 from symphony.errors import DataWarning
 from symphony.geometry.boxes import box_gap
@@ -40,12 +29,8 @@ SCALE = 20.0
 EVERYTHING = ObservationConfig(num_objects=16, num_points=30, route=True, clearance=True)
 
 
-def scenes_of(*segments: RunSegment, n: int = 2) -> Any:
-    return collate([scene(s, list(range(n)), LaneGraph(s.road)) for s in segments])
-
-
 def make_env(*segments, dynamics=None, config=EVERYTHING):
-    return DrivingEnv(scenes_of(*segments), dynamics, config)
+    return DrivingEnv(collate([scene(s, [0, 1], LaneGraph(s.road)) for s in segments]), dynamics, config)
 
 
 def bend(straight=10, turn=1.6, radius=15.0):
@@ -60,15 +45,12 @@ def one_route(line: NDArray[np.float64]) -> FollowedRoutes:
     return FollowedRoutes(torch.from_numpy(line), torch.tensor([[0]]), torch.tensor([[len(line)]]))
 
 
-def window(line: NDArray[np.float64], place: Any) -> RouteWindow:
-    """What is seen of a route by whoever has come to its point that is nearest to a place."""
-    here = SPACING * np.hypot(*(line - np.asarray(place)).T).argmin()
-    return one_route(line).window(torch.tensor([[here]], dtype=torch.float64))
-
-
 def see(x: float, y: float, heading: float, line: NDArray[np.float64]) -> torch.Tensor:
+    """What is seen of a route by whoever has come to its point that is nearest."""
     state = torch.tensor([[[x, y, heading, 5.0]]], dtype=torch.float64)
-    return route_ahead(state, window(line, (x, y)), SCALE)[0, 0]
+    here = SPACING * np.hypot(*(line - [x, y]).T).argmin()
+    window = one_route(line).window(torch.tensor([[here]], dtype=torch.float64))
+    return route_ahead(state, window, SCALE)[0, 0]
 
 
 def choices_of(state: torch.Tensor, *lines: NDArray[np.float64], turns: bool = False) -> torch.Tensor:
@@ -93,7 +75,7 @@ def test_seen_points_are_the_routes_points_ahead(line, where, offset, heading):
     back = complex(*place) + (ahead[exists, 0] + 1j * ahead[exists, 1]) * SCALE * np.exp(1j * heading)
     distance = np.hypot(*(line - place).T)
     first = min(int(distance.argmin()), len(line) - 2)
-    rows = [first + a for a in AHEAD[1:] if first + a < len(line)]
+    rows = [first + a for a in module.AHEAD[1:] if first + a < len(line)]
     np.testing.assert_allclose(np.stack([back.real, back.imag], -1), line[rows], atol=1e-6)
     # All of them lie ahead along the route, but for the last point, which a vehicle past the end still sees.
     route = shapely.LineString(line)
@@ -112,12 +94,10 @@ def test_moving_the_world_changes_no_feature(line, angle, x, y):
     place = line[3] + [0.4, 1.1]
     a, b = see(*place, 0.2, line), see(*there(place), 0.2 + angle, there(line))
     torch.testing.assert_close(a, b, atol=1e-6, rtol=0)
-    state = [torch.tensor([[[*place, 0.2, 5.0]]]), torch.tensor([[[*there(place), 0.2 + angle, 5.0]]])]
+    state, moved = [[[*place, 0.2, 5.0]]], [[[*there(place), 0.2 + angle, 5.0]]]
     for turns in (False, True):
-        one, two = (
-            choices_of(at.double(), each, turns=turns)
-            for at, each in zip(state, (line, there(line)), strict=True)
-        )
+        one = choices_of(torch.tensor(state).double(), line, turns=turns)
+        two = choices_of(torch.tensor(moved).double(), there(line), turns=turns)
         torch.testing.assert_close(one, two, atol=1e-6, rtol=0)
 
 
@@ -148,7 +128,7 @@ def test_what_else_is_in_the_table_changes_nothing(count, seed):
     first, length = (torch.from_numpy(rng.integers(0, 100, (2, 2, 3))) for _ in range(2))
     table[1, 250 : 250 + count] = torch.from_numpy(line)
     first[1, 0, 2], length[1, 0, 2] = 250, count
-    routes = Routes(table, first, length)
+    routes = module.Routes(table, first, length)
     found = routes.of(torch.tensor([1]), torch.tensor([[2, -1]]))
     points, exist = found.lines()
     assert torch.equal(points[0, 0, :count], torch.from_numpy(line))
@@ -162,10 +142,9 @@ def test_what_else_is_in_the_table_changes_nothing(count, seed):
     alone = one_route(line).progress(place[:, :1], progress[:, :1], moved[:, :1])
     assert torch.equal(found.progress(place, progress, moved)[:, :1], alone)
     for turns in (False, True):
-        features, mask = route_choices(
-            state.expand(1, 2, 4), routes.among(torch.tensor([1])), SCALE, turns=turns
-        )
-        assert features.shape == (1, 2, 3, CHOICE_FEATURES + TURN_FEATURES * turns)
+        among = routes.among(torch.tensor([1]))
+        features, mask = route_choices(state.expand(1, 2, 4), among, SCALE, turns=turns)
+        assert features.shape == (1, 2, 3, CHOICE_FEATURES + module.TURN_FEATURES * turns)
         assert torch.equal(mask, length[1:] > 1)
         assert torch.equal(features[0, 0, 2], choices_of(state, line, turns=turns)[0, 0, 0])
         assert (features[length[1:] == 0] == 0).all()
@@ -196,9 +175,8 @@ def test_the_logged_route_is_where_the_vehicle_drove(seed):
     for agent in range(4):
         table = route_table(segment, graph, agent)
         path = shapely.points(segment.position[agent, :, :2].astype(float))
-        away = [
-            shapely.distance(shapely.LineString(table.line(g)), path).mean() for g in range(len(table.count))
-        ]
+        drawn = [shapely.LineString(table.line(g)) for g in range(len(table.count))]
+        away = [shapely.distance(line, path).mean() for line in drawn]
         # Chords of 3 m cut an arc of 10 m radius by at most 0.11 m.
         assert table.right[table.logged]
         assert away[table.logged] < 0.12
@@ -381,10 +359,8 @@ def test_who_drives_under_a_bridge_has_no_route_over_it():
 ])  # fmt: skip
 @pytest.mark.parametrize("angle", [0.0, 2.0])
 def test_who_enters_would_meet_nobody_within_a_second(ahead, aside, speed, its_speed, enters, angle):
-    forward, left = (
-        torch.tensor([np.cos(angle), np.sin(angle)]),
-        torch.tensor([-np.sin(angle), np.cos(angle)]),
-    )
+    forward = torch.tensor([np.cos(angle), np.sin(angle)])
+    left = torch.tensor([-np.sin(angle), np.cos(angle)])
     rows = [
         torch.cat([place, torch.tensor([angle]), v * forward])
         for place, v in ((0 * forward, speed), (ahead * forward + aside * left, its_speed))

@@ -89,14 +89,11 @@ def test_expert_batches_show_what_the_environment_shows(dynamics: Any, tmp_path:
     assert seen.norm(dim=-1).min() * 20 > 1  # nobody sees itself
 
 
-def final_errors(found: list[RunSegment]) -> torch.Tensor:
-    return torch.cat([experts.error for experts in fit_experts(found, Bicycle())])
-
-
 @pytest.mark.parametrize("split", ["train", "test"])
 def test_the_fit_of_the_built_in_set_ends_near_the_log(split: str) -> None:
     store = SegmentStore(builtin_store(split))
-    errors = final_errors([store[item] for item in range(0, len(store), 3)])
+    found = fit_experts([store[item] for item in range(0, len(store), 3)], Bicycle())
+    errors = torch.cat([experts.error for experts in found])
     assert len(errors) > 100
     assert errors.mean() < 0.15
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import socket
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -13,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import helpers_distributed
-import helpers_runs
+import helpers_killed
 from helpers_convert import FakeReader
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
 from kills import Target
 from symphony.agents import load_agent
-from symphony.config import EvaluateConfig, ValidationConfig
+from symphony.config import EvaluateConfig
 from symphony.data import generate as generation
 from symphony.data.builtin import builtin_store
 from symphony.data.convert import convert
@@ -79,23 +78,15 @@ def _convert(logs: Path, out: Path) -> None:
 
 
 def _train(method: Any, store: Path, out: Path) -> None:
-    evaluated = ValidationConfig(data=store, segments=1, rollouts=1)
-    train(helpers_runs.tiny(method, store, out, steps=8, validation=evaluated, resume=True))
+    train(helpers_killed.config(method, store, out))
 
 
 def _train_by_two(method: Any, store: Path, out: Path) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
-    os.environ["TORCHELASTIC_RUN_ID"] = "kills"
-
     def one(rank: int) -> None:
         os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank)}
         _train(method, store, out)
 
-    children = [helpers_distributed.fork(one, rank) for rank in range(2)]
-    if any(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children):
+    if any(helpers_distributed.as_torchrun(one)):
         raise RuntimeError("a process of two failed")
 
 

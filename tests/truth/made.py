@@ -68,9 +68,7 @@ class Case:
     others: tuple[Track, ...] = ()
     right: dict[str, Any] = field(default_factory=dict)  # by the name of the number, see test_truth.check
     log: Track | None = None  # what the ego does in the log; by default the same
-    light: tuple[
-        tuple[float, SignalState], ...
-    ] = ()  # of the eastern lanes: second and state, until the next
+    light: tuple[tuple[float, SignalState], ...] = ()  # of the eastern lanes: second and state
     lanes: bool = True  # whether the map has lanes that cars drive in
     boundary: bool = True
     bridge: float = 0.0  # height of the road across over the other one
@@ -89,20 +87,14 @@ def road(lanes: bool, boundary: bool, bridge: float, deck: float) -> RoadMap:
     paved = shapely.box(-100, -7, 500, 3.5), shapely.box(163.25, -120, 166.75, 120)
     areas = [*zip(paved, (0.0, bridge), strict=True)] if bridge else [(shapely.union(*paved), 0.0)]
     areas += [(shapely.box(-100, -3.5, 500, 0), deck)] if deck else []
-    edges = [
-        shapely.get_coordinates(
-            shapely.force_3d(shapely.geometry.polygon.orient(area, 1.0), z), include_z=True
-        )
-        for area, z in areas
-    ]
+    rings = [shapely.force_3d(shapely.geometry.polygon.orient(area, 1.0), z) for area, z in areas]
+    edges = [shapely.get_coordinates(ring, include_z=True) for ring in rings]
     east = [_line((x0, y), (x1, y)) for y in (OWN, RIGHT) for x0, x1 in ((-100.0, STOP), (STOP, 500.0))]
     across = _line((165, -120), (165, 120))
     lines = [*east, _line((500, WEST), (-100, WEST)), np.insert(across, 2, bridge, axis=1)]
     lines += [np.insert(_line((500, OWN), (-100, OWN)), 2, deck, axis=1)] if deck else []
-    joined: dict[str, Any] = {
-        "successors": [(0, 1), (2, 3)], "left": [(2, 0), (3, 1)], "right": [(0, 2), (1, 3)],
-    }  # fmt: skip
-    found = make_road(lines, boundary=edges if boundary else [], **joined)
+    joined = [(0, 1), (2, 3)], [(2, 0), (3, 1)], [(0, 2), (1, 3)]  # ahead, to the left, to the right
+    found = make_road(lines, *joined, boundary=edges if boundary else [])
     # Nobody drives on lanes for bikes.
     return found if lanes else replace(found, lane_type=np.full(len(lines), LaneType.BIKE_LANE, np.uint8))
 
