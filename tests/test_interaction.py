@@ -26,8 +26,7 @@ def segments(path: Path, **options: object) -> list[RunSegment]:
 def test_tracks_of_the_public_layout(tmp_path: Path) -> None:
     path = public(tmp_path, CARS, [*walker("P1"), *walker("P2", speed=6)])
     segment = read_one("interaction", path)
-    assert segment.segment_id == "DR_X_000_t0"
-    assert segment.group == "DR_X_000"
+    assert (segment.segment_id, segment.group) == ("DR_X_000_t0", "DR_X_000")
     assert segment.file == "vehicle_tracks_000.csv"
     assert (segment.dt, segment.num_steps) == (0.1, 101)
     assert segment.agent_id.tolist() == [-3, -2, 3, 5, 9]
@@ -76,9 +75,8 @@ def test_an_ego_may_enter_late_and_leave_early(tmp_path: Path) -> None:
     (segment,) = segments(public(tmp_path, [*late, *early, *parked]))
     assert (segment.segment_id, segment.num_steps) == ("DR_X_000_t0", 71)
     assert segment.agent_id[segment.ego] == 3
-    np.testing.assert_allclose(
-        segment.position[segment.ego, :, 0] + segment.origin[0], np.arange(30, 101), atol=1e-4
-    )
+    x = segment.position[segment.ego, :, 0] + segment.origin[0]
+    np.testing.assert_allclose(x, np.arange(30, 101), atol=1e-4)
     alone = segments(public(tmp_path, [*track(9, steps=range(100)), *track(3, steps=range(140, 201))]))
     assert [one.num_steps for one in alone] == [100, 61]
     short = public(tmp_path, [*track(3, steps=range(55, 120)), *parked])
@@ -182,7 +180,9 @@ def test_states_logged_twice(tmp_path: Path) -> None:
 # What is refused
 
 GOOD = text(CARS)
-BROKEN = [
+
+
+@pytest.mark.parametrize(("content", "message"), [
     ("", "empty"), (GOOD[:-1], "cut short"), (GOOD.replace(",vy,", ",v,", 1), "0 columns of that name"),
     (GOOD.replace(",car,", ",", 1), "10 fields, expected 11"),
     (GOOD.replace(",2.0000,", ",inf,", 1), "'inf' can't be read"),
@@ -195,10 +195,7 @@ BROKEN = [
     (GOOD.replace(",car,", ",truck,", 1).replace(",truck,", ",bicycle,", 1), "more than one"),
     (GOOD.replace(",4.5,2.0", ",,"), "length and width must be positive"),
     (text(track(3, x=9000)), "away from the map"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("content", "message"), BROKEN)
+])  # fmt: skip
 def test_broken_tracks_are_refused(content: str, message: str, tmp_path: Path) -> None:
     path = public(tmp_path)
     path.write_text(content, encoding="utf-8")
@@ -208,26 +205,20 @@ def test_broken_tracks_are_refused(content: str, message: str, tmp_path: Path) -
 
 
 MAP, META_DATA, SIGNALS, LANES = "../../maps/k1.osm", "meta_data.csv", "signal_phases_001.csv", "k1_map.kml"
-COMPANIONS = [
-    (MAP, None, "the map is missing"),
-    (MAP, "<osm/>", "has no lanelets"),
+
+
+@pytest.mark.parametrize(("name", "content", "message"), [
+    (MAP, None, "the map is missing"), (MAP, "<osm/>", "has no lanelets"),
     (META_DATA, None, "away from the map"),  # another projection
-    (META_DATA, META.replace("001", "002"), "0 rows for recording 001"),
-    (META_DATA, META[:-1], "cut short"),
-    (SIGNALS, None, "are missing"),
-    (SIGNALS, PHASES[:-1], "cut short"),
+    (META_DATA, META.replace("001", "002"), "0 rows for recording 001"), (META_DATA, META[:-1], "cut short"),
+    (SIGNALS, None, "are missing"), (SIGNALS, PHASES[:-1], "cut short"),
     (SIGNALS, PHASES.replace("DARK", "PINK"), "is no phase"),
     (SIGNALS, PHASES.replace("2000", "1000"), "has two states"),
-    (SIGNALS, PHASES.replace("000,", ","), "the tracks at 11900 ms"),
-    (LANES, None, "are missing"),
+    (SIGNALS, PHASES.replace("000,", ","), "the tracks at 11900 ms"), (LANES, None, "are missing"),
     (LANES, KML.replace("<kml", "<!DOCTYPE kml><kml", 1), "document type"),
     (LANES, KML.replace("7, 8", "17, 18").replace(">8<", ">18<"), "fits a lane"),
-    (LANES, KML.replace(">2<", ">2, 3<", 1), "is not one lane"),
-    (LANES, KML.replace("7, 8", "7"), "1 for 2 sinks"),
-]
-
-
-@pytest.mark.parametrize(("name", "content", "message"), COMPANIONS)
+    (LANES, KML.replace(">2<", ">2, 3<", 1), "is not one lane"), (LANES, KML.replace("7, 8", "7"), "1 for 2 sinks"),
+])  # fmt: skip
 def test_broken_companions_are_refused(name: str, content: str | None, message: str, tmp_path: Path) -> None:
     path = taf(tmp_path)
     companion = (path.parent / name).resolve()

@@ -48,25 +48,20 @@ def test_a_road_cut_into_pieces_is_whole_again(gaps: list[float], angle: float, 
     order = rng.permutation(len(pieces))
     road, count = joined(make_road([pieces[k] for k in order]))
     place = np.argsort(order).tolist()
-    assert links(road) == set(pairwise(place))
-    assert count == len(pieces) - 1
+    assert (links(road), count) == (set(pairwise(place)), len(pieces) - 1)
     again, none = joined(road)
     assert none == 0
     assert again is road
 
 
 @pytest.mark.parametrize(("what", "start", "expected"), [
-    ("at the end", ((20, 0), (40, 0)), True),
-    ("just near enough", ((20 + REACH - 0.01, 0), (40, 0)), True),
-    ("too far", ((20 + REACH + 0.01, 0), (40, 0)), False),
-    ("beside it", ((20, -1.4), (40, -1.4)), True),
+    ("at the end", ((20, 0), (40, 0)), True), ("just near enough", ((20 + REACH - 0.01, 0), (40, 0)), True),
+    ("too far", ((20 + REACH + 0.01, 0), (40, 0)), False), ("beside it", ((20, -1.4), (40, -1.4)), True),
     ("in the next lane", ((20, -3.5), (40, -3.5)), False),
     ("bent a little", ((20, 0), (20 + 9 * np.cos(TURN - 0.01), 9 * np.sin(TURN - 0.01))), True),
     ("bent too far", ((20, 0), (20 + 9 * np.cos(TURN + 0.01), 9 * np.sin(TURN + 0.01))), False),
-    ("against it", ((20, 0), (0, 0)), False),
-    ("on a bridge", ((20, 0, 5), (40, 0, 5)), False),
-    ("a point", ((20, 0),), False),
-    ("begins a metre before the end", ((19, 0), (40, 0)), True),
+    ("against it", ((20, 0), (0, 0)), False), ("on a bridge", ((20, 0, 5), (40, 0, 5)), False),
+    ("a point", ((20, 0),), False), ("begins a metre before the end", ((19, 0), (40, 0)), True),
 ])  # fmt: skip
 def test_where_the_next_lane_must_begin(what: str, start: Any, expected: bool) -> None:
     road, count = joined(make_road([line((0, 0), (20, 0)), line(*start)]))
@@ -79,10 +74,7 @@ def test_no_branch_is_invented_where_lanes_are_linked() -> None:
     fed = make_road([here, on, aside], [(0, 1)])
     assert joined(fed)[1] == 0  # 0 leads somewhere, and 2 begins elsewhere
     road, count = joined(make_road([here, on, same], [(0, 1)]))
-    assert (count, links(road)) == (
-        1,
-        {(0, 1), (0, 2)},
-    )  # 2 begins at that very place, and nothing leads to it
+    assert (count, links(road)) == (1, {(0, 1), (0, 2)})  # 2 begins just there, and nothing leads to it
     ends = line((0, 1), (19.5, 0.2))
     road, count = joined(make_road([here, on, ends], [(0, 1)]))
     assert (count, links(road)) == (1, {(0, 1), (2, 1)})  # 2 would lead nowhere

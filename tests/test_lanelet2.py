@@ -34,8 +34,7 @@ def road_of(folder: Path, content: str) -> RoadMap:
 @pytest.mark.parametrize("how", ["xy", "local", "degrees"])
 def test_lanes_links_and_neighbours(how: str, tmp_path: Path) -> None:
     road = road_of(tmp_path, osm(how))
-    assert road.lane_id.tolist() == [101, 102, 103, 104]
-    assert road.successors.tolist() == [[0, 2], [1, 3]]
+    assert (road.lane_id.tolist(), road.successors.tolist()) == ([101, 102, 103, 104], [[0, 2], [1, 3]])
     assert road.left_neighbors.tolist() == [[0, 1], [2, 3]]
     assert road.right_neighbors.tolist() == [[1, 0], [3, 2]]
     np.testing.assert_allclose(road.lane_width, 4, atol=1e-4)
@@ -72,10 +71,8 @@ def test_the_boundary_is_open_at_both_ends(tmp_path: Path) -> None:
 @IN_FOLDER
 @given(st.lists(st.booleans(), min_size=len(WAYS), max_size=len(WAYS)), st.booleans())
 def test_the_direction_of_ways_does_not_matter(tmp_path: Path, turned: list[bool], swapped: bool) -> None:
-    ways = {
-        name: (tuple(nodes)[::-1] if turn else tuple(nodes), tags)
-        for (name, (nodes, tags)), turn in zip(WAYS.items(), turned, strict=True)
-    }
+    named = zip(WAYS.items(), turned, strict=True)
+    ways = {name: (tuple(nodes)[:: -1 if turn else 1], tags) for (name, (nodes, tags)), turn in named}
     lanelets = dict(reversed(LANELETS.items())) if swapped else LANELETS
     road, same = road_of(tmp_path, osm(ways=ways, lanelets=lanelets)), road_of(tmp_path, osm())
     pairs = (road.lane_id[links].tolist() for links in (road.successors, road.left_neighbors))
@@ -86,9 +83,7 @@ def test_the_direction_of_ways_does_not_matter(tmp_path: Path, turned: list[bool
 
 
 @pytest.mark.parametrize(("tags", "left", "right"), [
-    (DASHED, True, True),
-    (BORDER, False, False),
-    ({"type": "line_thin", "subtype": "solid_solid"}, False, False),
+    (DASHED, True, True), (BORDER, False, False), ({"type": "line_thin", "subtype": "solid_solid"}, False, False),
     ({"type": "line_thin", "subtype": "solid", "lane_change": "yes"}, True, True),
     ({"type": "line_thin", "subtype": "dashed", "lane_change": "no"}, False, False),
     # The solid one is on the left of the way as drawn: it may be crossed from its other side.

@@ -20,10 +20,8 @@ from symphony.metrics import (
     RolloutMetrics,
     curvature_histogram,
     jensen_shannon,
-    order_statistics,
-    passing_gap,
 )
-from symphony.metrics.order import REACH
+from symphony.metrics.order import REACH, order_statistics, passing_gap
 from test_selection import BY_CONTEXT, CASES, scene
 
 NUMBERS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
@@ -36,21 +34,15 @@ def kinds_of(kind: Any, step: Any = 0, playback: Any = False) -> CollisionKinds:
     return CollisionKinds(kind, torch.where(kind < 0, -1, step), kind, playback & (kind >= 0))
 
 
-def random_inputs(
-    seed: int, batch: int = 7, rollouts: int = 4, agents: int = 2, steps: int = 5
-) -> dict[str, Any]:
+def random_inputs(seed: int, batch: int = 7, rollouts: int = 4, agents: int = 2, steps: int = 5) -> Any:
     rng, shape, logged = np.random.default_rng(seed), (batch, rollouts, agents, steps), (batch, agents, steps)
     hits = np.where(rng.random((2, *shape[:3])) < 0.2, rng.integers(0, 8, (2, *shape[:3])), -1)
     names = [f"s{k:02d}" for k in rng.permutation(batch)]
     bounded = torch.tensor(rng.random(batch) < 0.9)
     return {
-        "segment_ids": names,
-        "groups": names,
-        "simulated": torch.ones(shape, dtype=torch.bool),
-        "logged": torch.tensor(rng.random(logged) < 0.8),
-        "at_states": torch.tensor(rng.random(shape) < 0.02),
+        "segment_ids": names, "groups": names, "bounded": bounded, "simulated": torch.ones(shape, dtype=torch.bool),
+        "logged": torch.tensor(rng.random(logged) < 0.8), "at_states": torch.tensor(rng.random(shape) < 0.02),
         "offroad": torch.tensor(rng.random(shape) < 0.1) & bounded[:, None, None, None],
-        "bounded": bounded,
         "displacement": torch.tensor(rng.gamma(2, 2, shape), dtype=torch.float32),
         "speed": torch.tensor(rng.gamma(0.5, 8, shape), dtype=torch.float32),
         "speed_log": torch.tensor(rng.gamma(0.5, 8, logged), dtype=torch.float32),
@@ -60,7 +52,7 @@ def random_inputs(
     } | {
         name: kinds_of(kind, rng.integers(0, steps, kind.shape), rng.random(kind.shape) < 0.5)
         for name, kind in zip(("kinds", "kinds_logged"), hits, strict=True)
-    }
+    }  # fmt: skip
 
 
 def part(inputs: dict[str, Any], take: list[int]) -> dict[str, Any]:
@@ -85,6 +77,10 @@ def same(one: Any, other: Any) -> bool:
     return repr(one) == repr(other)  # NaN is NaN
 
 
+def equal(one: RolloutMetrics, other: RolloutMetrics) -> bool:
+    return same((one.compute(), one.rows()), (other.compute(), other.rows()))
+
+
 def test_distances_and_the_divergence_by_hand() -> None:
     """Two segments, two rollouts, two agents, two steps."""
     # Segment 0: agent 0 is 1 m off in rollout 0 and 2 m in rollout 1, agent 1 is 5 m and 3 m off. Together rollout 1
@@ -92,10 +88,8 @@ def test_distances_and_the_divergence_by_hand() -> None:
     # the first step is logged.
     displacement = torch.tensor([[[1.0, 5], [2, 3]], [[4, 4], [1, 1]]])[..., None].repeat(1, 1, 1, 2)
     displacement[1, :, 1, 1] = 1e6
-    inputs = random_inputs(0, batch=2, rollouts=2, steps=2) | {
-        "segment_ids": ["a", "b"],
-        "displacement": displacement,
-    }
+    inputs = random_inputs(0, batch=2, rollouts=2, steps=2)
+    inputs |= {"segment_ids": ["a", "b"], "displacement": displacement}
     inputs["logged"] = torch.tensor([[[True, True], [True, True]], [[True, True], [True, False]]])
     inputs["curvature"] = [np.array([0.1, 0.1]), np.array([0.1, -0.2])]
     inputs["curvature_log"] = [np.array([0.1]), np.array([-0.2])]
@@ -161,8 +155,7 @@ def test_what_is_not_simulated_or_logged_is_not_read() -> None:
     inputs["offroad"][:, :, 1, 3:] = True
     inputs["displacement"][:, :, 1, 3:] = torch.nan
     inputs["displacement"][~inputs["logged"][:, None].expand_as(inputs["displacement"])] = torch.inf
-    assert same(scored(inputs).compute(), before.compute())
-    assert same(scored(inputs).rows(), before.rows())
+    assert equal(scored(inputs), before)
 
 
 @settings(max_examples=25, deadline=None)
@@ -175,9 +168,8 @@ def test_batches_processes_and_order_change_nothing(seed: int, cuts: list[int]) 
     for take in reversed(parts):
         # As it would come from another process.
         merged.merge(pickle.loads(pickle.dumps(scored(part(inputs, take)))))  # noqa: S301
-    for other in (batches, merged):
-        assert same(other.compute(), whole.compute())
-        assert same(other.rows(), whole.rows())
+    assert equal(batches, whole)
+    assert equal(merged, whole)
 
 
 def test_a_segment_seen_twice_is_refused() -> None:
@@ -230,17 +222,15 @@ def test_padding_changes_no_bit(agents: int, steps: int) -> None:
         elif isinstance(value, CollisionKinds):
             padded[name] = kinds_of(*(pad(each, (0, agents), value=-1) for each in value[:2]))
             inputs[name] = kinds_of(*value[:2])
-    assert same(scored(padded).rows(), scored(inputs).rows())
-    assert same(scored(padded).compute(), scored(inputs).compute())
+    assert equal(scored(padded), scored(inputs))
 
 
 def test_metrics_of_ones_own() -> None:
     metrics, rng = scored(random_inputs(6, batch=40)), np.random.default_rng(0)
     values = dict(zip(sorted(metrics.segments), rng.random(40), strict=True))
     for _ in range(9):
-        assert metrics.mean({name: values[name] for name in rng.permutation(list(values))}) == metrics.mean(
-            values
-        )
+        other = {name: values[name] for name in rng.permutation(list(values))}
+        assert metrics.mean(other) == metrics.mean(values)
     first, second, *_ = values
     some = dict.fromkeys(values, 2.0) | {first: math.nan}
     assert metrics.mean(some) == (2.0, 0.0)
@@ -296,11 +286,8 @@ def gap(a: torch.Tensor, b: torch.Tensor, **changes: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize(("mine", "theirs"), [(4.0, 6.0), (6.0, 4.5), (5.0, 5.5), (3.0, 10.0)])
-def test_crossing_paths(mine: float, theirs: float) -> None:
+def test_crossing_paths_and_those_that_do_not_meet(mine: float, theirs: float) -> None:
     assert gap(along_x(mine), along_y(theirs)) == pytest.approx(theirs - mine, abs=0.1)
-
-
-def test_paths_that_do_not_meet() -> None:
     assert math.isnan(gap(along_x(4.0), along_x(4.0) + torch.tensor([0.0, 3.5])))
     # The other one stops short of the crossing.
     assert math.isnan(gap(along_x(4.0), along_y(6.0).clamp(max=-3.0)))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import pytest
-import scipy
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 from tensordict import TensorDict
 
 from symphony.config import AgentConfig, AgentSpec
@@ -17,20 +17,13 @@ from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEAT
 from symphony.errors import ConfigError
 from symphony.geometry.frames import wrap
 from symphony.keys import OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, STATE, VALID
-from symphony.modules import (
-    BoundedDisplacement,
-    DisplacementHistogram,
-    ElementGroup,
-    displacement_policy,
-    inverse_cdf,
-)
-from symphony.modules.bounded import INSIDE, LEAST, SMOOTH, displaced, shares
+from symphony.modules import BoundedDisplacement, DisplacementHistogram, ElementGroup, displacement_policy
+from symphony.modules.bounded import INSIDE, LEAST, SMOOTH, displaced, inverse_cdf, shares
 from symphony.streams import Stream, fold_in, stream_of, uniform
 
 MASK = 2**64 - 1
 int64 = st.integers(-(2**63), 2**63 - 1)
-STREAM = -8660814866712981800
-"""Of the name ``a segment``, in every process."""
+STREAM = -8660814866712981800  # of the name ``a segment``
 
 
 def splitmix(state: int) -> int:
@@ -46,8 +39,7 @@ def folded(stream: int, index: int) -> int:
 
 def test_the_hash_is_splitmix64():
     # First output of the reference generator for state 0.
-    assert folded(0, 0) == 0xE220A8397B1DCDAF
-    assert int(fold_in(torch.tensor(0), 0)) & MASK == 0xE220A8397B1DCDAF
+    assert folded(0, 0) == int(fold_in(torch.tensor(0), 0)) & MASK == 0xE220A8397B1DCDAF
 
 
 @given(seed=int64, stream=int64, step=st.integers(0, 2**40))
@@ -57,13 +49,10 @@ def test_tensor_arithmetic_equals_unbounded_integers(seed, stream, step):
     assert uniform(seed, tensor, step).item() == (2 * (bits >> 41) + 1) * 2.0**-24
 
 
-def test_streams_keep_the_numbers_that_rollouts_were_made_with():
+def test_streams_keep_the_numbers_that_rollouts_were_made_with_in_every_process():
     first = 1 << 40
-    kept = {"GOALS": 0, "PRUNING": 1, "PLANNERS": 3, "WALKS": 5, "BACKTRACKING": first}
+    kept = {"GOALS": 0, "PRUNING": 1, "PLANNERS": 3, "WALKS": 5, "ENTRIES": 6, "BACKTRACKING": first}
     assert {stream.name: stream - first for stream in Stream} == kept
-
-
-def test_a_name_has_the_same_stream_in_every_process():
     assert stream_of("a segment") == STREAM != stream_of("a segment ")
     assert -(2**63) <= STREAM < 2**63
 
@@ -88,10 +77,8 @@ def test_impossible_categories_are_never_drawn(noise):
     assert allowed.gather(1, drawn[:, None]).all()
 
 
-GROUPS = (
-    ElementGroup(OBJECTS, OBJECTS_MASK, OBJECT_FEATURES),
-    ElementGroup(POINTS, POINTS_MASK, POINT_FEATURES),
-)
+NAMES = ((OBJECTS, OBJECTS_MASK, OBJECT_FEATURES), (POINTS, POINTS_MASK, POINT_FEATURES))
+GROUPS = tuple(ElementGroup(*names) for names in NAMES)
 DT, ACCELERATION, LATERAL, SLOPE = 0.2, 4.0, 6.0, 0.3
 REACH = ACCELERATION * DT**2
 INNER = INSIDE / math.sqrt(1 - INSIDE**2)
@@ -177,12 +164,12 @@ def test_draws_are_those_of_the_gaussian(how):
     for k in range(2):
         u = dist.latent(drawn)[:, k]
         standard = (u - dist.loc[k]) / dist.scale[k]
-        assert scipy.stats.kstest(standard.detach().numpy(), "norm").pvalue > 1e-3
+        assert stats.kstest(standard.detach().numpy(), "norm").pvalue > 1e-3
         assert (u < dist.loc[k]).double().mean() == pytest.approx(0.5, abs=0.02)
     ends = torch.tensor([[2.0**-24, 1 - 2.0**-24]])
     assert make(dtype=torch.float32).icdf(ends).isfinite().all()
     across = drawn[:, 1] / drawn[:, 0]
-    assert abs(scipy.stats.spearmanr(drawn[:, 0].numpy(), across.numpy()).statistic) < 0.03
+    assert abs(stats.spearmanr(drawn[:, 0].numpy(), across.numpy()).statistic) < 0.03
 
 
 numbers = st.floats(-1e6, 1e6, width=32)
@@ -197,7 +184,7 @@ def test_every_draw_can_be_driven(speed, length, first, second):
     sizes = {OWN: (SELF_FEATURES,), STATE: (4,), OBJECTS: (5, OBJECT_FEATURES), POINTS: (40, POINT_FEATURES)}
     for key, size in sizes.items():
         td[key] = torch.rand(1, 1, *size, generator=generator)
-    for key, mask in ((OBJECTS, OBJECTS_MASK), (POINTS, POINTS_MASK)):
+    for key, mask, _ in NAMES:
         td[mask] = td[key][..., 0] < 0.7
     td[OWN][..., 1] = length / 5.0
     td[STATE][..., 3] = speed
@@ -262,20 +249,15 @@ def test_the_density_integrates_to_one_and_is_that_of_the_draws(pace):
     torch.testing.assert_close(drawn[drawn[:, 0] >= LEAST].sum(0) / len(drawn), expected, rtol=0, atol=5e-3)
 
 
-shares_inside = st.floats(2**-24, 1 - 2**-24)
+SHARES = st.tuples(*[st.floats(2**-24, 1 - 2**-24)] * 2)
 
 
 @settings(max_examples=30)
-@given(
-    st.lists(st.floats(-80, 80), min_size=F * L, max_size=F * L),
-    shares_inside,
-    shares_inside,
-    st.floats(0, 8),
-)
-def test_any_numbers_give_a_displacement(logits, first, second, pace):
+@given(st.lists(st.floats(-80, 80), min_size=F * L, max_size=F * L), SHARES, st.floats(0, 8))
+def test_any_numbers_give_a_displacement(logits, inside, pace):
     for dtype in (torch.float32, torch.float64):
         dist = histogram(logits=logits, pace=pace, dtype=dtype)
-        drawn = dist.icdf(torch.tensor([first, second], dtype=dtype))
+        drawn = dist.icdf(torch.tensor(inside, dtype=dtype))
         assert drawn.isfinite().all()
         assert dist.log_prob(drawn).isfinite()
         assert 0 <= drawn[0] <= pace + REACH + 0.02
@@ -291,9 +273,8 @@ def test_gradients_by_differences_of_histogram():
         return DisplacementHistogram(*parts, REACH, F).log_prob(inside)
 
     assert torch.autograd.gradcheck(likelihood, (logits, pace, slope))
-    assert torch.autograd.gradcheck(
-        lambda x: DisplacementHistogram(x, pace, slope, REACH, F).mean_share, logits
-    )
+    mean_share = lambda x: DisplacementHistogram(x, pace, slope, REACH, F).mean_share  # noqa: E731
+    assert torch.autograd.gradcheck(mean_share, logits)
 
 
 def test_a_draw_moves_with_the_mean_and_is_the_same_with_a_gradient():

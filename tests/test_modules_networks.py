@@ -35,7 +35,6 @@ def results(network, elements, mask, mode):
 
 
 def reference(network, elements, mask):
-    """One set, one element at a time."""
     rows = []
     for row, row_mask in zip(elements, mask, strict=True):
         encoded = [network(element) for element, ok in zip(row, row_mask, strict=True) if ok]
@@ -167,11 +166,8 @@ def scene(*batch, agents=3, seed=0, own=6, objects=(4, 10), points=(60, 9), rout
 
     td = TensorDict(batch_size=batch)
     td[keys.OWN], td[keys.ROUTE], td[keys.ROAD] = randn(own), randn(6), 5 * randn(5)
-    for key, mask, size in (
-        (keys.OBJECTS, keys.OBJECTS_MASK, objects),
-        (keys.POINTS, keys.POINTS_MASK, points),
-    ):
-        td[key], td[mask] = randn(*size), chance(0.7, size[0])
+    td[keys.OBJECTS], td[keys.OBJECTS_MASK] = randn(*objects), chance(0.7, objects[0])
+    td[keys.POINTS], td[keys.POINTS_MASK] = randn(*points), chance(0.7, points[0])
     td[keys.GAP], td[keys.GAP_AHEAD] = 5 * randn(objects[0]), 5 * randn(objects[0], len(modules.FORESIGHT))
     td[keys.ROUTES], td[keys.ROUTES_MASK] = randn(*routes), chance(0.6, routes[0])
     td[keys.ROUTES_MASK][..., 0, :], td[keys.ROUTES_MASK][..., -1, :] = True, False
@@ -180,10 +176,8 @@ def scene(*batch, agents=3, seed=0, own=6, objects=(4, 10), points=(60, 9), rout
     return td
 
 
-GROUPS = (
-    modules.ElementGroup(keys.OBJECTS, keys.OBJECTS_MASK, 10),
-    modules.ElementGroup(keys.POINTS, keys.POINTS_MASK, 9),
-)
+NAMES = (keys.OBJECTS, keys.OBJECTS_MASK, 10), (keys.POINTS, keys.POINTS_MASK, 9)
+GROUPS = tuple(modules.ElementGroup(*names) for names in NAMES)
 
 
 def policy(**kwargs):
@@ -232,7 +226,7 @@ def test_padding_and_order_change_nothing_for_valid_agents(points):
     permuted = actor(TensorDict({"agents": agents}, [8]))[keys.LOGITS]
     torch.testing.assert_close(permuted, logits[:, order], rtol=1e-5, atol=1e-6)
     dirty = td.clone()
-    for key, mask in ((keys.POINTS, keys.POINTS_MASK), (keys.OBJECTS, keys.OBJECTS_MASK)):
+    for key, mask, _ in NAMES:
         dirty[key] = torch.where(td[mask][..., None], td[key], torch.nan)
     absent = ~td[keys.VALID]
     assert absent.any()
@@ -247,20 +241,16 @@ def test_padding_and_order_change_nothing_for_valid_agents(points):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
 
 
-def goals_scene(*batch):
-    return scene(*batch, valid=2.0)
-
-
-def goals_policy():
+def goals(*batch):
     torch.manual_seed(0)
-    return modules.goal_policy(6, GROUPS, 7, hidden=16)
+    return scene(*batch, valid=2.0), modules.goal_policy(6, GROUPS, 7, hidden=16)
 
 
 @settings(max_examples=20)
 @given(st.permutations(range(6)))
 @torch.no_grad()
 def test_the_order_of_routes_is_kept(order):
-    td, network = goals_scene(4), goals_policy()
+    td, network = goals(4)
     plain = network(td.clone())[keys.GOAL_LOGITS]
     td[keys.ROUTES], td[keys.ROUTES_MASK] = td[keys.ROUTES][..., order, :], td[keys.ROUTES_MASK][..., order]
     assert torch.equal(network(td)[keys.GOAL_LOGITS], plain[..., order])
@@ -268,27 +258,24 @@ def test_the_order_of_routes_is_kept(order):
 
 @torch.no_grad()
 def test_padding_of_routes_changes_nothing_whatever_it_holds():
-    td, network = goals_scene(50), goals_policy()
+    td, network = goals(50)
     td[keys.GOAL_NOISE] = torch.rand(50, 3, generator=torch.Generator().manual_seed(1))
     plain = network(td.clone())
     for fill in (0.0, 1e9, float("nan"), float("inf")):
         wide = td.clone()
         wide[keys.ROUTES] = torch.cat([td[keys.ROUTES], torch.full((50, 3, 4, 7), fill)], -2)
-        wide[keys.ROUTES_MASK] = torch.cat(
-            [td[keys.ROUTES_MASK], torch.zeros(50, 3, 4, dtype=torch.bool)], -1
-        )
+        wide[keys.ROUTES_MASK] = nn.functional.pad(td[keys.ROUTES_MASK], (0, 4))
         out = network(wide)
         assert torch.equal(out[keys.GOAL_LOGITS][..., :6], plain[keys.GOAL_LOGITS])
-        assert torch.equal(
-            *(modules.drawn_goals(each[keys.GOAL], each[keys.ROUTES_MASK]) for each in (out, plain))
-        )
+        drawn = (modules.drawn_goals(each[keys.GOAL], each[keys.ROUTES_MASK]) for each in (out, plain))
+        assert torch.equal(*drawn)
         masked = td.clone()
         masked[keys.ROUTES] = torch.where(td[keys.ROUTES_MASK][..., None], td[keys.ROUTES], fill)
         assert torch.equal(network(masked)[keys.GOAL_LOGITS], plain[keys.GOAL_LOGITS])
 
 
 def test_padding_gets_no_gradient_and_gives_none_that_is_not_finite():
-    td, network = goals_scene(20), goals_policy()
+    td, network = goals(20)
     routes = torch.where(td[keys.ROUTES_MASK][..., None], td[keys.ROUTES], float("nan")).requires_grad_()
     td[keys.ROUTES] = routes
     td[keys.GOAL] = modules.drawn_goals(td[keys.ROUTES_MASK].int().argmax(-1), td[keys.ROUTES_MASK])
@@ -303,7 +290,7 @@ def test_padding_gets_no_gradient_and_gives_none_that_is_not_finite():
 
 @torch.no_grad()
 def test_agents_and_routes_do_not_influence_each_other():
-    td, network = goals_scene(4), goals_policy()
+    td, network = goals(4)
     plain = network(td.clone())[keys.GOAL_LOGITS]
     other = td.clone()
     other[keys.ROUTES][:, 0, 2] = 5.0
@@ -318,7 +305,7 @@ def test_agents_and_routes_do_not_influence_each_other():
 
 @torch.no_grad()
 def test_an_agent_without_a_route_or_that_is_padding_gets_none_and_no_other_one_that_does_not_exist():
-    td, network = goals_scene(200), goals_policy()
+    td, network = goals(200)
     td[keys.VALID][:50, 0] = False
     td[keys.GOAL_NOISE] = torch.rand(200, 3)
     out = network(td)
@@ -359,19 +346,17 @@ def test_one_score_per_agent_and_none_for_padding_that_may_hold_anything(batch, 
 
 @torch.no_grad()
 @settings(max_examples=10)
-@given(
-    st.floats(0, 6.28), st.floats(1.001, 50), st.floats(0, 0.999), st.sampled_from(["clearance", "foresight"])
-)
+@given(st.floats(0, 6.28), st.floats(1.001, 50), st.floats(0, 0.999), st.sampled_from(KINDS[1:]))
 def test_nothing_beyond_the_radius_matters(angle, far, near, features):
     network, td = realism(features, radius=0.8), observation()
     td[keys.OBJECTS_MASK][0, 1] = td[keys.POINTS_MASK][0, 4] = True
-    turn = torch.tensor([angle]).cos(), torch.tensor([angle]).sin()
+    turn = torch.tensor([angle, angle - torch.pi / 2]).cos()
 
     def with_elements_at(distance, value):
         changed = td.clone()
         for key, row in ((keys.OBJECTS, 1), (keys.POINTS, 4)):
             changed[key][0, row] = value
-            changed[key][0, row, :2] = 0.8 * distance * torch.cat(turn)
+            changed[key][0, row, :2] = 0.8 * distance * turn
         changed[keys.GAP][0, 1] = value
         return network(changed)[keys.SCORE]
 
@@ -382,7 +367,7 @@ def test_nothing_beyond_the_radius_matters(angle, far, near, features):
     assert not torch.equal(with_elements_at(near, 30.0)[0], with_elements_at(near, -70.0)[0])
 
 
-@pytest.mark.parametrize("features", ["clearance", "foresight"])
+@pytest.mark.parametrize("features", KINDS[1:])
 def test_gradient_flows_through_every_floating_input(features):
     td, network = observation(30), realism(features)
     leaves = {k: td[k].requires_grad_() for k in network.in_keys if td[k].is_floating_point()}

@@ -13,18 +13,8 @@ from torch.nn import functional
 from torchrl.modules import MaskedCategorical, OneHotCategorical
 from torchrl.objectives import BCLoss as TorchRLBCLoss
 
-from helpers_objectives import (
-    ACTION,
-    LOGITS,
-    OBSERVATION,
-    ROLLOUT,
-    VALID,
-    batch,
-    categorical_actor,
-    check_contract,
-    gaussian_actor,
-    learned,
-)
+from helpers_objectives import OBSERVATION, batch, categorical_actor, check_contract, gaussian_actor, learned
+from symphony.keys import ACTION, LOGITS, ROLLOUT, VALID
 from symphony.objectives import BCLoss, DistillationLoss
 
 KINDS = pytest.mark.parametrize("kind", [BCLoss, DistillationLoss])
@@ -86,9 +76,8 @@ def test_weights_of_rollouts_make_a_policy_gradient():
     """The loss is linear in them; experts have none, and 1 is none."""
     td, loss = batch(30), DistillationLoss(categorical_actor())
     weight, plain = torch.randn(td[VALID].shape), loss(td)["loss_distillation"]
-    weighted = [
-        loss(td.clone().set(("agents", "weight"), w))["loss_distillation"] for w in (0 * weight + 1, weight)
-    ]
+    tds = (td.clone().set(("agents", "weight"), w) for w in (0 * weight + 1, weight))
+    weighted = [loss(each)["loss_distillation"] for each in tds]
     torch.testing.assert_close(weighted[0], plain)
     rollout = td[VALID] & td[ROLLOUT]
     each = DistillationLoss(categorical_actor(), reduction="none")(td)["loss_distillation"]

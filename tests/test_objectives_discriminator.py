@@ -18,19 +18,10 @@ SCORE, SIMULATED = ("agents", "score"), ("agents", "simulated")
 PENALTY = {"gradient_penalty": 0.3}
 
 
-class Squeeze(nn.Module):
-    def __init__(self, network):
-        super().__init__()
-        self.network = network
-
-    def forward(self, *inputs):
-        return self.network(*inputs).squeeze(-1)
-
-
-def discriminator():
+def discriminator(*layers):
     torch.manual_seed(0)
-    net = nn.Sequential(nn.Linear(4, 16), nn.Tanh(), nn.Linear(16, 1))
-    return TensorDictModule(Squeeze(net), in_keys=[OBSERVATION], out_keys=[SCORE])
+    net = nn.Sequential(*(layers or (nn.Linear(4, 16), nn.Tanh(), nn.Linear(16, 1))), nn.Flatten(-2))
+    return TensorDictModule(net, in_keys=[OBSERVATION], out_keys=[SCORE])
 
 
 def batch(*shape, agents=3):
@@ -57,8 +48,7 @@ def test_by_hand():
     fake = torch.tensor([0.5, 0.8, 0.9, 0.2]).log().mean()
     real = torch.tensor([0.9, 0.4]).log().mean()
     torch.testing.assert_close(out["loss_discriminator"], -(fake + real) / 2)
-    assert out["accuracy_simulated"] == 0.5
-    assert out["accuracy_data"] == 0.5
+    assert (out["accuracy_simulated"], out["accuracy_data"]) == (0.5, 0.5)
     torch.testing.assert_close(out["score_simulated"], probability[:4].logit().mean())
     torch.testing.assert_close(out["score_data"], probability[4:].logit().mean())
     assert out["auc"] == 0.75
@@ -122,7 +112,7 @@ def test_the_penalty_of_a_linear_discriminator_is_its_weight(reduction):
     """The gradient of w . x is w wherever x is."""
     td = batch(20)
     net = nn.Linear(4, 1)
-    network = TensorDictModule(Squeeze(net), in_keys=[OBSERVATION], out_keys=[SCORE])
+    network = discriminator(net)
     arguments = {"reduction": reduction}
     out = DiscriminatorLoss(network, gradient_penalty=0.5, **arguments)(td)
     plain = DiscriminatorLoss(network, **arguments)(td)
@@ -143,8 +133,7 @@ def test_bad_inputs_are_refused():
     loss = DiscriminatorLoss(discriminator())
     with pytest.raises(KeyError, match="no flag under"):
         loss(td.exclude(SIMULATED))
-    wrong = td.clone()
-    wrong[SIMULATED] = wrong[SIMULATED].float()
+    wrong = td.clone().set(SIMULATED, td[SIMULATED].float())
     with pytest.raises(ValueError, match=r"flag .* is torch.float32"):
         loss(wrong)
     wrong[SIMULATED] = td[SIMULATED][..., None]

@@ -28,7 +28,6 @@ from test_modules_displacement import GROUPS
 
 PLAN, SEEN = "noise_plan", [OWN, OBJECTS, POINTS]
 STEPS = 5
-SIZES = (SELF_FEATURES, OBJECT_FEATURES, POINT_FEATURES)
 SEES = ObservationConfig(num_objects=4, num_points=20, clearance=True)
 
 
@@ -52,7 +51,7 @@ def actor():
 
 def realism():
     torch.manual_seed(1)
-    return discriminator(*SIZES, hidden=8, head=(8,)).double()
+    return discriminator(SELF_FEATURES, OBJECT_FEATURES, POINT_FEATURES, hidden=8, head=(8,)).double()
 
 
 def planned(env, *scenes, steps=STEPS, seed=0):
@@ -71,10 +70,13 @@ def value_and_gradient(loss, td):
     return value.detach(), torch.autograd.grad(value.sum(), list(loss.parameters()))
 
 
-def assert_same(one, other, **tolerance):
-    torch.testing.assert_close(one[0], other[0], **tolerance)
-    for a, b in zip(one[1], other[1], strict=True):
-        torch.testing.assert_close(a, b, **tolerance)
+def added(*parts):
+    values, gradients = zip(*parts, strict=True)
+    return sum(values), tuple(map(sum, zip(*gradients, strict=True)))
+
+
+def assert_same(one, other):
+    torch.testing.assert_close((one[0], *one[1]), (other[0], *other[1]))
 
 
 def assert_other_gradient(one, other, by):
@@ -101,10 +103,12 @@ def test_it_is_the_mean_cost_of_what_the_actor_drives_into(env, cost):
     # The road ends after four steps.
     counted = torch.ones(2, STEPS, 2, dtype=torch.bool)
     counted[1, 4:] = False
-    wanted = {
-        "mean": costs[counted].mean(), "sum": costs[counted].sum(), "none": torch.where(counted, costs, 0.0),
-    }  # fmt: skip
-    for reduction, value in wanted.items():
+    of = costs[counted]
+    for reduction, value in (
+        ("mean", of.mean()),
+        ("sum", of.sum()),
+        ("none", torch.where(counted, costs, 0.0)),
+    ):
         out = make(env, cost=cost, reduction=reduction)(td)
         torch.testing.assert_close(out["loss_mgail"], value)
         torch.testing.assert_close(out["mgail_score"], score[counted].mean().detach())
@@ -145,8 +149,7 @@ def test_cut_at_every_step_it_is_the_sum_of_single_steps(env):
         states, _ = by_hand(env, actor(), realism(), td)
     single = make(env, reduction="sum")
     ones = (states[t].copy().set(PLAN, td[PLAN][:, t : t + 1]) for t in range(STEPS))
-    parts = [value_and_gradient(single, one) for one in ones]
-    total = sum(part[0] for part in parts), [sum(g) for g in zip(*(p[1] for p in parts), strict=True)]
+    total = added(*(value_and_gradient(single, one) for one in ones))
     cut = make(env, reduction="sum", truncate=1)
     assert_same(value_and_gradient(cut, td), total)
     whole = value_and_gradient(make(env, reduction="sum"), td)
@@ -193,11 +196,9 @@ def test_scenes_padding_and_batches_add_up():
     for k, steps in enumerate((STEPS, 4)):
         one = planned(alone[k], 0).set(PLAN, td[PLAN][k : k + 1, :steps])
         parts.append(value_and_gradient(make(alone[k], reduction="sum"), one))
-    one, other = parts
-    assert_same(both, (one[0] + other[0], [a + b for a, b in zip(one[1], other[1], strict=True)]))
+    assert_same(both, added(*parts))
     again = torch.stack([td, td.flip(0)], 1)
-    twice = value_and_gradient(make(env, reduction="sum"), again)
-    assert_same(twice, (2 * both[0], [2 * g for g in both[1]]))
+    assert_same(value_and_gradient(make(env, reduction="sum"), again), added(both, both))
     assert_same(value_and_gradient(make(env), again), value_and_gradient(make(env), td))
     none = make(env, reduction="none")
     assert none(again)["loss_mgail"].shape == (2, 2, STEPS, 3)
@@ -255,13 +256,11 @@ def test_it_keeps_the_contract_of_torchrl(agents, arguments):
 def test_copies_have_a_discriminator_of_their_own(env):
     td, loss = planned(env), make(env)
     clone = copy.deepcopy(loss)
-    with torch.no_grad():
-        for p in clone.discriminator.parameters():
-            p.zero_()
+    for p in clone.discriminator.parameters():
+        p.data.zero_()
     assert clone(td)["mgail_score"] == 0 != loss(td)["mgail_score"]
     loss.reset_parameters_recursive()
-    pairs = zip(loss.discriminator.parameters(), realism().parameters(), strict=True)
-    assert all(torch.equal(*pair) for pair in pairs)
+    assert all(map(torch.equal, loss.discriminator.parameters(), realism().parameters()))
     assert len(list(loss.parameters())) == len(list(actor().parameters()))
 
 
@@ -281,10 +280,8 @@ def test_bad_calls_are_refused(env):
 def test_an_episode_ends_once():
     """An environment that comes back into its bounds is scored like one that stays out."""
     torch.manual_seed(0)
-    names, how = (
-        ["loc", "scale"],
-        {"distribution_class": IndependentNormal, "default_interaction_type": "random"},
-    )
+    names = ["loc", "scale"]
+    how = {"distribution_class": IndependentNormal, "default_interaction_type": "random"}
     body = TensorDictModule(nn.Sequential(nn.Linear(2, 2), NormalParamExtractor()), ["place"], names)
     head = ProbabilisticTensorDictModule(names, ["action"], **how)
     policy = ProbabilisticTensorDictSequential(body, head)

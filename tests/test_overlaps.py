@@ -72,8 +72,7 @@ def overlapped(seed: int = 0) -> RunSegment:
 
 def test_who_counts() -> None:
     segment = overlapped()
-    assert overlapping(segment).tolist() == [[0, 2]]
-    assert overlapping(straight_road(4)).tolist() == []
+    assert (overlapping(segment).tolist(), overlapping(straight_road(4)).tolist()) == ([[0, 2]], [])
     # Not where one of them is not there, and not where neither is a vehicle that moves.
     assert overlapping(hide(segment, 0, slice(15, 45))).tolist() == []
     types = segment.agent_type.copy()
@@ -105,8 +104,7 @@ def test_a_conversion_counts_and_tells(tmp_path: Path) -> None:
     assert "of 2 of 5 segments (40.0 %)" in report.warning
     store = SegmentStore(tmp_path / "all")
     tagged = {store.ids[i] for i in range(5) if store.tags(i).get("overlaps")}
-    assert tagged == {"bad-1", "bad-5"}
-    assert info(tmp_path / "all")["overlaps"] == 2
+    assert (tagged, info(tmp_path / "all")["overlaps"]) == ({"bad-1", "bad-5"}, 2)
     assert Report.from_json(json.loads(json.dumps(report.to_json()))) == report
     (tmp_path / "more.mixed").write_text("6 x7")
     convert(Mixed(), [tmp_path / "more.mixed"], tmp_path / "more", workers=2)
@@ -117,5 +115,4 @@ def test_a_conversion_counts_and_tells(tmp_path: Path) -> None:
     assert (without.converted, without.overlaps, without.warning) == (4, 0, "")
     assert without.exclusions["overlaps"] == 3
     assert without.settings["exclude_overlaps"] is True
-    assert {skip.segment for skip in without.skipped} == {"bad-1", "bad-5", "bad-7"}
-    assert without.problems == {}
+    assert ({skip.segment for skip in without.skipped}, without.problems) == ({"bad-1", "bad-5", "bad-7"}, {})

@@ -21,12 +21,8 @@ import lint_length
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-
-
-NEEDS = {
-    extra: list(map(Requirement, lines))
-    for extra, lines in {"core": PROJECT["dependencies"], **PROJECT["optional-dependencies"]}.items()
-}
+LISTED = {"core": PROJECT["dependencies"], **PROJECT["optional-dependencies"]}
+NEEDS = {extra: list(map(Requirement, lines)) for extra, lines in LISTED.items()}
 RUNTIME = {*NEEDS} - {"dev", "docs"}
 
 
@@ -43,9 +39,8 @@ def make(*arguments: str, cwd: Path = ROOT, **environment: str) -> subprocess.Co
     # The tests may themselves be run by make, with settings of its own.
     own = ("MAKE", "MFLAGS", "PYTHON", "VENV", "CONSTRAINTS")
     env = {key: value for key, value in os.environ.items() if not key.startswith(own)} | environment
-    return subprocess.run(
-        [program, *arguments], cwd=cwd, env=env, capture_output=True, text=True, check=False
-    )
+    command = [program, *arguments]
+    return subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.parametrize("file", ["constraints.txt", "constraints-lowest.txt"])
@@ -60,8 +55,7 @@ def test_every_dependency_is_pinned_within_its_range(file: str) -> None:
 
 @pytest.mark.parametrize(("page", "line"), [
     ("README.md", r"# with extras: (.+)"),
-    ("README.md", r"Extras: (.+)\."),
-    ("docs/index.md", r"The extras are (.+?\(Gymnasium\))\."),
+    ("README.md", r"Extras: (.+)\."), ("docs/index.md", r"The extras are (.+?\(Gymnasium\))\."),
 ])  # fmt: skip
 def test_pages_name_the_extras_that_there_are(page: str, line: str) -> None:
     found = re.findall(line, (ROOT / page).read_text())[0]
@@ -94,8 +88,7 @@ def test_pins_reach_everything_the_core_needs() -> None:
 
 
 @pytest.mark.parametrize(("target", "commands"), [
-    ("demo", "bin/symphony demo --out out/demo"),
-    ("table", "bin/python benchmarks/make_table.py --out out/table"),
+    ("demo", "bin/symphony demo --out out/demo"), ("table", "bin/python benchmarks/make_table.py --out out/table"),
     ("test", "bin/python -m pytest"),
     ("lint", "ruff check|ruff format --check|codespell|mypy|lint-imports|tests/tools/lint_length.py"),
     ("docs", "bin/mkdocs build --strict"),
@@ -139,18 +132,13 @@ def test_a_wheel_holds_all_of_the_package(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     (wheel,) = tmp_path.glob("symphony_traffic-*.whl")
     held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
-    files = [
-        path
-        for path in (ROOT / "src" / "symphony").rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
-    ]
+    paths = (path for path in (ROOT / "src" / "symphony").rglob("*") if path.is_file())
+    files = [path for path in paths if "__pycache__" not in path.parts]
     # A link to a folder at the top, whose files no search of this kind finds.
     recipes = {f"symphony/recipes/{file.name}" for file in (ROOT / "recipes").glob("*.py")}
     assert held == recipes | {str(file.relative_to(ROOT / "src")) for file in files}
-    assert held >= {
-        f"symphony/{part}"
-        for part in ("py.typed", "data/builtin/test/store.json", "pretrained/bc_ts_h/config.json")
-    }
+    parts = ("py.typed", "data/builtin/test/store.json", "pretrained/bc_ts_h/config.json")
+    assert held >= {f"symphony/{part}" for part in parts}
 
 
 def test_ci_runs_lint_then_tests(tmp_path: Path) -> None:
@@ -189,20 +177,15 @@ def test_long_files_and_rooms_are_found(tmp_path: Path) -> None:
         assert lint_length.updated(tmp_path).splitlines()[0] == rows[0].format(size).replace("|  |", "| |")
     (tmp_path / "docs" / "page.md").write_text("word " * 13)
     (tmp_path / "CONTRIBUTING.md").write_text(rows[1])
-    assert lint_length.large_rooms(tmp_path) == [
-        "docs: 13 words, may have 12",
-        "deep: has no place in the table of CONTRIBUTING.md",
-    ]
+    told = ["docs: 13 words, may have 12", "deep: has no place in the table of CONTRIBUTING.md"]
+    assert lint_length.large_rooms(tmp_path) == told
 
 
 def skeleton(root: Path) -> Path:
     """A package with our packages' names and nothing in them."""
     package, source = root / "symphony", ROOT / "src" / "symphony"
-    for path in (
-        *source.glob("*.py"),
-        *source.glob("*/__init__.py"),
-        source / "wosac" / "scorer" / "__init__.py",
-    ):
+    kinds = ("*.py", "*/__init__.py", "wosac/scorer/__init__.py")
+    for path in (path for kind in kinds for path in source.glob(kind)):
         file = package / path.relative_to(source)
         file.parent.mkdir(parents=True, exist_ok=True)
         file.touch()
@@ -214,8 +197,7 @@ IMPORTS = [
     ("geometry/a.py", "import symphony.errors", True), ("geometry/b.py", "import symphony.roadgraph", False),
     ("roadgraph/a.py", "import symphony.geometry", True),
     ("roadgraph/c.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import symphony.data", True),
-    ("data/c.py", "import symphony.geometry", False),
-    ("envs/b.py", "def f():\n    import symphony.metrics", False),
+    ("data/c.py", "import symphony.geometry", False), ("envs/b.py", "def f():\n    import symphony.metrics", False),
     ("modules/c.py", "import symphony.config", False), ("objectives/b.py", "import symphony.geometry", False),
     ("render/b.py", "import symphony.metrics", False),
     ("training/a.py", "import symphony.metrics, symphony.modules, symphony.render, symphony.config", True),

@@ -66,10 +66,6 @@ def brakes(observation: Observation) -> Control:
     return Control(-1.0, 0.0)
 
 
-def hurries(observation: Observation) -> Control:
-    return Control(5.0, 0.0)
-
-
 class Together:
     """Brakes; all of a batch are asked at once."""
 
@@ -116,9 +112,7 @@ def process(tmp_path: Path, kind: str, said: str = "") -> str:
 def test_equal_planners_of_every_kind_drive_alike(store: Path, tmp_path: Path) -> None:
     """A function, a function in a file, a batch and a process that plan the same lead to the same states."""
     (tmp_path / "beside.py").write_text("BRAKING = 1.0\n")
-    (tmp_path / "my.py").write_text(
-        "from beside import BRAKING\n\ndef plan(seen):\n    return (-BRAKING, 0.0)\n"
-    )
+    (tmp_path / "my.py").write_text("from beside import BRAKING\nplan = lambda seen: (-BRAKING, 0.0)\n")
     kinds: dict[str, Any] = {"function": brakes, "file": f"{tmp_path}/my.py:plan", "batch": Together}
     kinds["process"] = process(tmp_path, "brakes")
     found = {name: run(store, tmp_path / name, planner) for name, planner in kinds.items()}
@@ -127,8 +121,7 @@ def test_equal_planners_of_every_kind_drive_alike(store: Path, tmp_path: Path) -
     for name, folder in found.items():
         np.testing.assert_array_equal(np.stack([saved.state for saved in folder]), first, err_msg=name)
         assert not any(saved.failed for saved in folder)
-    assert max(Together.asked) == 4
-    assert found["function"].about.drivers["ego"] == f"{__name__}:brakes"
+    assert (max(Together.asked), found["function"].about.drivers["ego"]) == (4, f"{__name__}:brakes")
     assert found["file"].about.drivers["ego"] == kinds["file"]
 
 
@@ -136,8 +129,7 @@ def test_equal_planners_of_every_kind_drive_alike(store: Path, tmp_path: Path) -
     ("says", '{"step": 2, "plan": [NaN, 0.0]}', "step 2: .*not finite"),
     ("says", "[-1.0, 0.0]", 'step 2: ValueError: answered .* not {"step": 2, '),
     ("says", '{"error": "lost my way"}', "step 2: RuntimeError: lost my way"),
-    ("says", "what?", "step 2: JSONDecodeError"),
-    ("flood", "", "step 2: .*an answer of more than 1048576 bytes"),
+    ("says", "what?", "step 2: JSONDecodeError"), ("flood", "", "step 2: .*an answer of more than 1048576 bytes"),
     ("binary", "", "step 2: .*(UnicodeDecodeError|JSONDecodeError|more than one line)"),
     ("debug", "", "step 2: .*(more than one line for an answer|answered)"),
     ("twice", "", "step [23]: .*(more than one line for an answer|answered)"),
@@ -229,24 +221,18 @@ def test_the_observation_is_all_in_si_units(store: Path, tmp_path: Path) -> None
         assert (one.time, one.dt) == (pytest.approx(t * segment.dt), pytest.approx(segment.dt))
         ego = [*saved.state[0, t, 0], *segment.size[segment.ego, :2]]
         np.testing.assert_allclose(one.ego, ego, atol=1e-4)
-        for (x, y), logged in (
-            ((agents.x, agents.y), segment.position[others, t, :2]),
-            ((agents.vx, agents.vy), segment.velocity[others, t]),
-        ):
-            np.testing.assert_allclose(np.stack([x, y], -1), logged, atol=1e-4)
-        assert agents.id.tolist() == segment.agent_id[others].tolist()
-        assert set(agents.type) == {"vehicle"}
+        moves = np.stack([agents.x, agents.y, agents.vx, agents.vy], -1)
+        logged = np.concatenate([segment.position[others, t, :2], segment.velocity[others, t]], -1)
+        np.testing.assert_allclose(moves, logged, atol=1e-4)
+        assert (agents.id.tolist(), set(agents.type)) == (segment.agent_id[others].tolist(), {"vehicle"})
         assert len(one.lanes) == len(segment.road.lanes)
         assert not any(lane.points.flags.writeable for lane in one.lanes)
         assert one.route.ndim == 2
         # The last 2 s are as they were seen then.
         before = {other.step: other for other in seen if other.segment_id == one.segment_id}
-        assert len(one.history) == min(t, 10)
-        for step, past in enumerate(one.history, start=max(t - 10, 0)):
-            np.testing.assert_allclose(
-                [past.time, *past.ego], [before[step].time, *before[step].ego], atol=1e-4
-            )
-            for mine, other in zip(past.agents, before[step].agents, strict=True):
+        for past, then in zip(one.history, (before[step] for step in range(max(t - 10, 0), t)), strict=True):
+            np.testing.assert_allclose([past.time, *past.ego], [then.time, *then.ego], atol=1e-4)
+            for mine, other in zip(past.agents, then.agents, strict=True):
                 np.testing.assert_array_equal(mine, other)
 
 
@@ -255,9 +241,7 @@ def test_bounds_and_neighbours_of_lanes() -> None:
     segment = crossing(4, steps=11)
     road = segment.road
     for lost in (False, True):
-        width = (
-            np.where(np.arange(len(road.lanes)) == 0, np.nan, road.lane_width) if lost else road.lane_width
-        )
+        width = np.where(lost & (np.arange(len(road.lanes)) == 0), np.nan, road.lane_width)
         known = segment.replace(road=dataclasses.replace(road, lane_width=width.astype(np.float32)))
         lanes = lanes_of(scenario_of(known, 0, np.zeros((0, 2)), np.zeros(4), 0))
         assert np.isnan(lanes[0].left).all() == np.isnan(lanes[0].right).all() == lost
@@ -267,20 +251,13 @@ def test_bounds_and_neighbours_of_lanes() -> None:
                 away = shapely.distance(middle, shapely.points(bound))
                 np.testing.assert_allclose(away, lane.width / 2, rtol=2e-2)
             np.testing.assert_allclose((lane.left + lane.right) / 2, lane.points, atol=1e-9)
-            ring = shapely.LinearRing([*lane.right, *lane.left[::-1]])
-            assert ring.is_ccw
-            for name, pairs in (
-                ("successors", road.successors),
-                ("predecessors", road.successors[:, ::-1]),
-                ("left_neighbors", road.left_neighbors),
-                ("right_neighbors", road.right_neighbors),
-            ):
+            assert shapely.LinearRing([*lane.right, *lane.left[::-1]]).is_ccw
+            for name in ("successors", "predecessors", "left_neighbors", "right_neighbors"):
+                pairs = road.successors[:, ::-1] if name == "predecessors" else getattr(road, name)
                 assert set(getattr(lane, name)) == set(road.lane_id[pairs[pairs[:, 0] == k, 1]].tolist())
 
 
-FINE = dict.fromkeys(
-    ["failed", "at_fault_collision", "red_lights", "offroad_time", "beyond_route", "no_route"], 0
-)
+FINE = dict.fromkeys(("failed", "at_fault_collision", "red_lights", "beyond_route", "no_route"), 0)
 
 
 @pytest.mark.parametrize(("changes", "score"), [
@@ -292,7 +269,7 @@ FINE = dict.fromkeys(
     ({"collision": True}, 50.0), ({"red_lights": 1}, 0.0), ({"offroad_time": 2.0}, 0.0),
 ])  # fmt: skip
 def test_the_score_of_a_run(changes: dict[str, Any], score: float | None) -> None:
-    assert run_score({**FINE, "progress_ratio": 0.5, **changes}) == score
+    assert run_score({**FINE, "offroad_time": 0, "progress_ratio": 0.5, **changes}) == score
 
 
 def test_the_command_compares_planners_among_crowds(store, tmp_path, capsys):
@@ -341,7 +318,7 @@ def test_runs_without_defined_progress_have_no_score(tmp_path: Path) -> None:
 
     where = {"way": (0, 10), "beside": (200, 10), "stands": (200, 0), "end": (0, 10, 30)}
     fill(tmp_path / "store", [driven(name, *place) for name, place in where.items()])
-    record = planner_record(alone(tmp_path / "store", tmp_path / "sim", hurries))
+    record = planner_record(alone(tmp_path / "store", tmp_path / "sim", lambda seen: Control(5.0, 0.0)))
     runs = {one["segment"]: one for one in record["per_run"]}
     names = ("progress_ratio", "beyond_route", "no_route")
     found = {key: tuple(one[name] for name in names) for key, one in runs.items()}

@@ -48,17 +48,13 @@ def few() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shown = [straight_road(4, steps=6), crossing(4, steps=5), crossing(5, seed=1, steps=6)]
-    fill(path := tmp_path_factory.mktemp("data") / "train", shown)
-    return path
+    return fill(tmp_path_factory.mktemp("data") / "train", shown).path
 
 
 @pytest.fixture(scope="module")
 def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    fill(
-        path := tmp_path_factory.mktemp("data") / "held_out",
-        [crossing(6, seed=seed, steps=5) for seed in range(10, 14)],
-    )
-    return path
+    found = [crossing(6, seed=seed, steps=5) for seed in range(10, 14)]
+    return fill(tmp_path_factory.mktemp("data") / "held_out", found).path
 
 
 def config(store: Path, out: Path, every: int, method: Any = "bc", **changes: Any) -> TrainConfig:
@@ -71,18 +67,11 @@ def media(run: Path) -> list[str]:
 
 def numbers_of(run: Path, previews: bool) -> dict[int, dict[str, Any]]:
     """What was recorded of a run's previews, or of all else but its validation and its speed, by the update."""
-    return {
-        r["step"]: found
-        for r in read_metrics(run)
-        if (
-            found := {
-                k: v
-                for k, v in r.items()
-                if not k.startswith(("updates_per_second", "validation_"))
-                and k.startswith("preview_") == previews
-            }
-        )
-    }
+    found = {}
+    for r in read_metrics(run):
+        kept = [k for k in r if not k.startswith(("updates_per_second", "validation_"))]
+        found[r["step"]] = {k: r[k] for k in kept if k.startswith("preview_") == previews}
+    return {step: values for step, values in found.items() if values}
 
 
 previewed = partial(numbers_of, previews=True)
@@ -101,12 +90,12 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(config(store, tmp_path_factory.mktemp("runs") / "bc_ts_h", 4, "bc_ts_h", steps=5))
+    return train(config(store, tmp_path_factory.mktemp("runs") / "bc_ts_h", 2, "bc_ts_h", steps=5))
 
 
 def test_a_run_shows_itself_now_and_then_and_at_its_end(run: Path) -> None:
-    assert media(run) == [f"rollout-00000{step}.gif" for step in (4, 5)]
-    assert list(previewed(run)) == [4, 5]
+    assert media(run) == [f"rollout-00000{step}.gif" for step in (2, 4, 5)]
+    assert list(previewed(run)) == [2, 4, 5]
     for name in media(run):
         with Image.open(run / "media" / name) as image:
             assert image.n_frames == 5
@@ -120,8 +109,7 @@ def test_being_watched_changes_nothing(store, held_out, tmp_path, method, valida
         for n, data in ((0, None), (2, held_out if validated else None))
     )
     assert same_weights(weights(f"{blind}@last"), weights(f"{watched}@last"))
-    assert len(media(watched)) == 2
-    assert numbers_of(blind, False) == numbers_of(watched, False)
+    assert (len(media(watched)), numbers_of(blind, False)) == (2, numbers_of(watched, False))
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -201,28 +189,18 @@ def test_the_log_is_like_itself_and_what_is_not_there_is_left_out() -> None:
     assert math.isfinite(numbers["preview_speed_log_p50"])
 
 
-class Recorder:
-    """Stands in for a run of Weights & Biases."""
-
-    def __init__(self) -> None:
-        self.logged: list[tuple[int, dict[str, Any]]] = []
-        self.finish = lambda: None
-
-    def log(self, values: dict[str, Any], step: int) -> None:
-        self.logged.append((step, values))
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_weights_and_biases_gets_video_and_histograms(store: Path, tmp_path: Path, monkeypatch: Any) -> None:
     import wandb
 
-    recorder = Recorder()
+    recorder, logged = Mock(), list[tuple[int, dict[str, Any]]]()
+    recorder.log = lambda values, step: logged.append((step, values))
     monkeypatch.delenv("WANDB_MODE", raising=False)
     monkeypatch.setattr(wandb, "init", lambda **_: recorder)
     early = replace(tiny("mgail", store, tmp_path).mgail, regression=2)
     run = train(config(store, tmp_path / "run", 2, "mgail", mgail=early, wandb="offline"))
-    assert [step for step, _ in recorder.logged] == sorted(step for step, _ in recorder.logged)
-    found = {step: values for step, values in recorder.logged if "preview/rollout" in values}
+    assert [step for step, _ in logged] == sorted(step for step, _ in logged)
+    found = {step: values for step, values in logged if "preview/rollout" in values}
     assert list(found) == [2, 4]
     motions = {f"preview/{name}{kind}" for name in MOTIONS for kind in ("", "_log")}
     assert found[2].keys() == {"preview/rollout", "preview/ade", *motions}
@@ -251,8 +229,7 @@ def test_a_run_is_named_once_at_weights_and_biases_and_its_variables_hold(tmp_pa
     assert [given["resume"] for given in told[:3]] == [None, "allow", None]
     assert told[0]["id"] == told[1]["id"] != told[2]["id"]
     assert re.fullmatch(r"[0-9a-f]{8}", told[3]["id"])
-    monkeypatch.setattr(
-        wandb, "init", Mock(side_effect=wandb.errors.UsageError("No API key configured.\nlog in."))
-    )
+    locked = wandb.errors.UsageError("No API key configured.\nlog in.")
+    monkeypatch.setattr(wandb, "init", Mock(side_effect=locked))
     with pytest.raises(ConfigError, match=r"^Weights & Biases: No API key .*log in\. .*--wandb offline$"):
         Tracker(tmp_path, {}, "online")

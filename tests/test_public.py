@@ -14,7 +14,7 @@ from helpers_store import fill
 
 MOST = 60
 """Modules of the package that plain behavioural cloning reaches, at most."""
-NOT_NEEDED = (
+UNUSED = (
     "cli collectors envs.driving evaluation metrics render planners.interface rollouts.unroll rollouts.search"
 )
 ROOMS = "agents config envs modules learning objectives roadgraph rollouts training wosac"
@@ -51,7 +51,7 @@ def test_cloning_loads_nothing_that_it_does_not_use(tmp_path: Path) -> None:
     said = output_of(cloned, tmp_path / "data", tmp_path / "run", said=tmp_path / "said")
     reached = set(said.partition("modules:")[2].split())
     assert "symphony.recipes.bc" in reached
-    unused = {"matplotlib.pyplot", "wandb", *(f"symphony.{name}" for name in NOT_NEEDED.split())}
+    unused = {"matplotlib.pyplot", "wandb", *(f"symphony.{name}" for name in UNUSED.split())}
     assert not unused & reached
     own = sorted(name for name in reached if name.startswith("symphony."))
     assert len(own) <= MOST, own

@@ -21,7 +21,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 from PIL import Image, ImageSequence
 
@@ -174,8 +173,7 @@ def test_map_is_drawn_where_it_lies_and_in_view() -> None:
     assert (*axes.get_xlim(), *axes.get_ylim()) == (0, 60, -20, 20)
     for bottom, lanes in ((2.0, 2), (200.0, 0)):
         axes = plot_segment(straight_road(3), blank(), view=(0.0, 60.0, bottom, bottom + 40))
-        assert len(by_gid(axes, "lanes").get_segments()) == lanes
-        assert ("surface" in gids(axes)) == bool(lanes)
+        assert (len(by_gid(axes, "lanes").get_segments()), "surface" in gids(axes)) == (lanes, bool(lanes))
 
 
 def test_lanes_without_width_have_a_surface_and_those_of_one_point_none() -> None:
@@ -251,16 +249,13 @@ def test_rollouts_are_drawn_over_the_log() -> None:
 
 
 def test_padding_changes_nothing() -> None:
-    plain, padded = (
-        plot_rollout(rollouts(straight_road(4), agents), blank()) for agents in ([0, 2], [0, -1, 2])
-    )
+    rows = [0, 2], [0, -1, 2]
+    plain, padded = (plot_rollout(rollouts(straight_road(4), agents), blank()) for agents in rows)
     for drawn in (gids, labels, Axes.get_xlim):
         assert drawn(plain) == drawn(padded)
     for gid in ("rollouts-2", "ends-2"):
-        first, second = (
-            [path.vertices for path in by_gid(axes, gid).get_paths()] for axes in (plain, padded)
-        )
-        np.testing.assert_array_equal(first, second)
+        paths = (by_gid(axes, gid).get_paths() for axes in (plain, padded))
+        np.testing.assert_array_equal(*([path.vertices for path in each] for each in paths))
 
 
 def test_rollouts_end_at_their_last_valid_step_and_gaps_of_logs_stay() -> None:
@@ -281,9 +276,7 @@ def test_events_are_marked_where_they_begin() -> None:
     axes = plot_rollout(given, blank())
     expected = [given.position[where] for where in ((0, 1, 5), (0, 1, 30), (2, 0, 0))]
     drawn = by_gid(axes, "collision").get_offsets()
-    np.testing.assert_allclose(
-        *(np.array(sorted(map(tuple, points))) for points in (drawn, expected)), atol=1e-3
-    )
+    np.testing.assert_allclose(*(sorted(map(tuple, points)) for points in (drawn, expected)), atol=1e-3)
     assert "collision" in labels(axes)
     assert "offroad" not in gids(axes)
     assert "off road" not in labels(axes)
@@ -308,11 +301,8 @@ def test_agents_have_their_colours_in_pictures_and_pages() -> None:
     assert len(set(colors_of(straight_road(8), range(8)))) == 8
     segment = straight_road(30)
     axes = plot_segment(segment, blank(), interactive=list(range(1, 30)))
-    for drawn, color in (
-        (PolyCollection.get_facecolor, AGENT_COLORS[0]),
-        (PolyCollection.get_edgecolor, INK),
-    ):
-        shown = [tuple(drawn(by_gid(axes, f"box-{k}"))[0][:3]) for k in range(30)]
+    for name, color in (("facecolor", AGENT_COLORS[0]), ("edgecolor", INK)):
+        shown = [tuple(getattr(by_gid(axes, f"box-{k}"), f"get_{name}")()[0][:3]) for k in range(30)]
         assert [k for k in range(30) if shown[k] == to_rgb(color)] == [segment.ego]
     assert len([label for label in labels(axes) if label.startswith(("ego", "interactive"))]) == 8
     assert "and 22 more in colour" in labels(axes)
@@ -333,10 +323,7 @@ def test_panels_of_a_grid_are_of_one_size_however_far_rollouts_go(tmp_path: Path
 
 
 def test_pictures_need_no_window_and_no_torch() -> None:
-    code = (
-        "import sys, symphony.render.video\n"
-        "assert 'matplotlib.pyplot' not in sys.modules and 'torch' not in sys.modules, 'heavy import'"
-    )
+    code = "import sys, symphony.render.video; assert not {'matplotlib.pyplot', 'torch'} & {*sys.modules}"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
@@ -401,10 +388,8 @@ def test_films_of_the_same_and_of_padding_are_equal_files(tmp_path: Path) -> Non
 def test_collisions_are_marked_from_where_they_begin(tmp_path: Path) -> None:
     segment, hit = straight_road(2, steps=8), np.zeros((1, 2, 8), bool)
     hit[0, 1, 4:6] = True
-    plain, marked = (
-        frames([rollouts(segment, [0, 1], 1, collision=flags)], tmp_path / "a.gif")
-        for flags in (hit & False, hit)
-    )
+    clips = (rollouts(segment, [0, 1], 1, collision=flags) for flags in (hit & False, hit))
+    plain, marked = (frames([clip], tmp_path / "a.gif") for clip in clips)
     # Around the cars, where no legend is.
     middle = np.s_[:, int(0.45 * plain.shape[1]) : int(0.8 * plain.shape[1])]
     changed = (abs(plain[middle].astype(int) - marked[middle]) > 60).any((1, 2, 3))
@@ -438,9 +423,7 @@ def test_an_evaluation_can_be_animated(tmp_path: Path) -> None:
 
 
 def records(count: int = 30, **metrics: float) -> list[dict[str, float]]:
-    return [
-        {"step": 20 * (k + 1), **{name: value * k for name, value in metrics.items()}} for k in range(count)
-    ]
+    return [{"step": 20 * (k + 1)} | {name: x * k for name, x in metrics.items()} for k in range(count)]
 
 
 def test_every_metric_has_a_panel_and_every_run_two_lines(tmp_path: Path) -> None:
@@ -465,12 +448,8 @@ def test_every_metric_has_a_panel_and_every_run_two_lines(tmp_path: Path) -> Non
 
 
 def test_missing_and_odd_values_are_tolerated(tmp_path: Path) -> None:
-    nan = math.nan
-    odd: list[dict[str, Any]] = [
-        {"step": 1, "auc": nan, "note": "text"},
-        {"step": 2, "auc": None, "flag": True},
-    ]
-    odd.append({"step": 3, "auc": 0.5, "late": nan})
+    odd: list[dict[str, Any]] = [{"step": 1, "auc": (nan := math.nan), "note": "text"}]
+    odd += [{"step": 2, "auc": None, "flag": True}, {"step": 3, "auc": 0.5, "late": nan}]
     curves = read_curves(odd)
     assert list(curves) == ["auc", "late"]
     np.testing.assert_array_equal(curves["auc"], [[1, 2, 3], [nan, nan, 0.5]])
@@ -478,15 +457,12 @@ def test_missing_and_odd_values_are_tolerated(tmp_path: Path) -> None:
 
 
 @settings(deadline=None, max_examples=25)
-@given(
-    arrays(np.float64, st.integers(1, 40), elements=st.floats(-1e3, 1e3) | st.just(math.nan)), st.floats(0, 1)
-)
+@given(arrays(float, st.integers(1, 40), elements=st.floats(-1e3, 1e3) | st.just(math.nan)), st.floats(0, 1))
 def test_smoothing_stays_within_the_values_around(values: np.ndarray, window: float) -> None:
     found, reach = smoothed(values, window), round(window * len(values) / 2)
     for k, average in enumerate(found):
-        near = values[max(0, k - reach) : k + reach + 1]
-        near = near[np.isfinite(near)]
-        expected = near.mean() if len(near) else math.nan
+        near = [x for x in values[max(0, k - reach) : k + reach + 1] if np.isfinite(x)]
+        expected = np.mean(near) if near else math.nan
         assert average == pytest.approx(expected, abs=1e-6, nan_ok=True)
 
 

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers_saved import played, searched
-from helpers_segments import LANE_WIDTH, crossing, make_road, make_segment, straight_road
+from helpers_segments import LANE_WIDTH, crossing, make_road, make_segment, straight_road, turned
 from helpers_store import fill
 from helpers_table import make_entry, make_record, make_run
 from symphony.cli import main
@@ -34,7 +34,7 @@ from symphony.evaluation.table import Entry, paper_figures
 from symphony.geometry import box_gap
 from symphony.metrics.intervals import clustered_mean
 from symphony.rollouts.driving import playback
-from symphony.saved.folder import About, RolloutWriter, save_rollouts
+from symphony.saved.folder import About, RolloutWriter, load_rollouts, save_rollouts
 from symphony.saved.rollouts import SavedRollouts, saved_rollouts, world_of
 from test_pretrained import load_script
 
@@ -96,8 +96,7 @@ def test_a_known_profile_has_its_acceleration_jerk_and_lateral_acceleration() ->
 
 
 def rows(saved: SavedRollouts, evaluated: Any = "interactive") -> list[dict[str, Any]]:
-    found = Report("made", evaluated)
-    add_segment(found, saved)
+    add_segment(found := Report("made", evaluated), saved)
     return found.rows
 
 
@@ -148,14 +147,11 @@ def test_a_red_light_is_run_where_the_front_crosses_the_stop_point() -> None:
 def test_failed_runs_and_groups_are_told_apart(tmp_path: Path) -> None:
     hit = driving((0, 0, 0, 12), (10, 0, 0, 7), segment_id="hit")
     free = driving((0, 0, 0, 7), (10, 0, 0, 7), segment_id="free")
-    writer = RolloutWriter(tmp_path / "sim", ABOUT)
-    writer.add(played(hit.replace(group="north"), rollouts=2))
-    writer.add(played(free.replace(group="south"), rollouts=2, failed={1: "planner raised ValueError"}))
-    writer.fail("lost", 2, "no ego")
-    writer.close()
-    folder = save_rollouts(tmp_path / "sim", ABOUT, [])
-    found = report(folder)
-    totals = found.totals()
+    with RolloutWriter(tmp_path / "sim", ABOUT) as writer:
+        writer.add(played(hit.replace(group="north"), rollouts=2))
+        writer.add(played(free.replace(group="south"), rollouts=2, failed={1: "planner raised ValueError"}))
+        writer.fail("lost", 2, "no ego")
+    totals = (found := report(load_rollouts(tmp_path / "sim"))).totals()
     assert (totals["runs"], totals["failed_runs"], totals["segments"], totals["groups"]) == (6, 3, 3, 2)
     assert totals["collision_rate"] == pytest.approx(100 * 2 / 3)
     # Groups of 2 and 1 runs, all and none of which collided.
@@ -166,8 +162,7 @@ def test_failed_runs_and_groups_are_told_apart(tmp_path: Path) -> None:
     assert found.plain()["collisions"] == [
         {"kind": "into leader", "other": "vehicle", "at_fault": True, "with_playback": True, "collisions": 2}
     ]
-    assert totals["offroad_time"] == 0
-    assert totals["max_jerk"] == pytest.approx(0, abs=1e-3)
+    assert (totals["offroad_time"], totals["max_jerk"]) == (0, pytest.approx(0, abs=1e-3))
 
 
 def test_times_are_percent_of_what_was_driven() -> None:
@@ -193,9 +188,8 @@ def test_contacts_are_those_that_the_simulation_flagged() -> None:
     """Of the included agent, and of the log: no collision of the flags is missing or made up."""
     _, found = searched()
     for saved in [*found, played(straight_road(6), [0, 1]), played(crossing(4), [0, 2])]:
-        report_ = Report("made", "interactive")
-        add_segment(report_, saved)
-        events = report_.events[saved.segment.segment_id]
+        add_segment(made := Report("made", "interactive"), saved)
+        events = made.events[saved.segment.segment_id]
         for k in range(saved.rollouts):
             hit = {e.agent for e in events if e.rollout == k and e.kind == "collision"}
             assert hit == set(saved.agents[(saved.collision[k] & saved.counted[k]).any(0)].tolist())
@@ -224,15 +218,7 @@ def test_logged_driving_breaks_no_rules(logs: str, request: Any, tmp_path: Path)
 
 def test_moving_and_turning_the_world_changes_nothing() -> None:
     segment = driving((0, 0, 0, 12), (10, 0, 0, 7), (5, LANE_WIDTH, 0, 9))
-    angle, shift, lanes = 0.7, np.array([150.0, -80, 0], np.float32), segment.road.lanes
-    turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    moved = Polylines((lanes.points @ turn + shift).astype(np.float32), lanes.offsets)
-    other = segment.replace(
-        position=(segment.position @ turn + shift).astype(np.float32),
-        heading=segment.heading + np.float32(angle),
-        velocity=(segment.velocity @ turn[:2, :2]).astype(np.float32),
-        road=dataclasses.replace(segment.road, lanes=moved),
-    )
+    other = turned(segment, 0.7, np.array([150.0, -80], np.float32))
     one, two = (rows(played(each, [0, 1]))[0] for each in (segment, other))
     for name, value in one.items():
         assert two[name] == (pytest.approx(value, abs=2e-2) if isinstance(value, float) else value), name
@@ -311,8 +297,7 @@ def test_factors_are_held_from_their_bound_on(before: float, after: float, other
 def test_differences_are_held_by_their_sign(before: float, after: float) -> None:
     found = relations([entry("bc_h", min_sade=before), entry("bc_ts_h", min_sade=after)])
     one = of(found, "min_sade", "bc_h", "bc_ts_h")
-    assert one["value"] == pytest.approx(after - before)
-    assert one["held"] == (after <= before)
+    assert (one["value"], one["held"]) == (pytest.approx(after - before), after <= before)
     assert one["clear"] == (abs(one["value"]) > 2 * one["se"])
 
 
@@ -320,8 +305,7 @@ def test_differences_are_held_by_their_sign(before: float, after: float) -> None
 def test_divergences_must_differ_by_more_than_sampling(shift: float, held: bool) -> None:
     rng, entries = np.random.default_rng(0), [entry("bc"), entry("bc_ts")]
     for one, mean in zip(entries, (0.0, shift), strict=True):
-        noise = rng.normal(0, 0.001, 40)
-        values = mean + noise - noise.mean()
+        values = mean + (noise := rng.normal(0, 0.001, 40)) - noise.mean()
         one.record["curvature"]["parts"] = {f"g{k}": part for k, part in enumerate(values)}
     found = of(relations(entries), "curvature_jsd", "bc", "bc_ts")
     assert (found["held"], found["value"]) == (held, pytest.approx(shift))

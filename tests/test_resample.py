@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from helpers_convert import FakeReader
@@ -58,9 +59,7 @@ def test_interpolation_is_exact_for_uniform_motion() -> None:
     time = np.arange(new.num_steps) * 0.15
     expected = log.position[:, :1, :2] + log.velocity[:, :1] * time[:, None]
     np.testing.assert_allclose(new.position[..., :2], expected, atol=1e-4)
-    np.testing.assert_allclose(
-        new.velocity, np.broadcast_to(log.velocity[:, :1], new.velocity.shape), atol=1e-5
-    )
+    np.testing.assert_allclose(new.velocity - log.velocity[:, :1], 0, atol=1e-5)
 
 
 def test_between_a_valid_and_an_invalid_step_nothing_is_made_up() -> None:
@@ -70,11 +69,7 @@ def test_between_a_valid_and_an_invalid_step_nothing_is_made_up() -> None:
     assert not new.position[1, 7:12].any()
 
 
-@given(
-    st.lists(st.lists(st.integers(0, 8), min_size=7, max_size=7), min_size=12, max_size=12).map(
-        lambda rows: np.array(rows, np.uint8)
-    )
-)
+@given(arrays(np.uint8, (12, 7), elements=st.integers(0, 8)))
 @settings(max_examples=15, deadline=None)
 def test_held_lights_are_never_unknown_if_they_were_ever_known(state: NDArray[np.uint8]) -> None:
     log = crossing(2, steps=7, dt=0.2).replace(signal_state=state)
@@ -82,7 +77,7 @@ def test_held_lights_are_never_unknown_if_they_were_ever_known(state: NDArray[np
     for before, after in zip(state.tolist(), held.signal_state.tolist(), strict=True):
         known = [value for value in before if value]
         for step, value in enumerate(after):
-            past = [known_before for known_before in before[: step + 1] if known_before]
+            past = [seen for seen in before[: step + 1] if seen]
             assert value == (past[-1] if past else known[0] if known else SignalState.UNKNOWN)
     assert held.signal_state.dtype == log.signal_state.dtype
     assert content_hash(hold_lights(held)) == content_hash(held)
@@ -124,14 +119,11 @@ def along_x(speed: NDArray[Any], heading: float) -> RunSegment:
 
 
 def test_the_heading_follows_the_motion_only_when_moving() -> None:
-    fast = smooth(along_x(np.full(40, 5.0), 0.2), 0.3)
-    np.testing.assert_allclose(fast.heading, 0.0, atol=1e-5)
-    slow = smooth(along_x(np.full(40, 0.5), 0.2), 0.3)
-    np.testing.assert_allclose(slow.heading, 0.2, atol=1e-5)
-    back = smooth(along_x(np.full(40, -5.0), 0.1), 0.3)  # keeps facing the same way
-    np.testing.assert_allclose(back.heading, 0.0, atol=1e-5)
-    around = smooth(along_x(np.full(40, 5.0), 4 * np.pi), 0.3)  # stays on the logged branch
-    np.testing.assert_allclose(around.heading, 4 * np.pi, atol=1e-5)
+    # Backwards it keeps facing the same way, after two turns it stays on the logged branch.
+    whole = 4 * np.pi
+    for speed, heading, expected in ((5.0, 0.2, 0.0), (0.5, 0.2, 0.2), (-5.0, 0.1, 0.0), (5.0, whole, whole)):
+        found = smooth(along_x(np.full(40, speed), heading), 0.3)
+        np.testing.assert_allclose(found.heading, expected, atol=1e-5)
     starting = smooth(along_x(np.linspace(0, 6, 60), 0.2), 0.3)
     assert np.abs(np.diff(starting.heading)).max() < 0.05
 
@@ -187,8 +179,7 @@ def seen_at(times: NDArray[np.float64]) -> RunSegment:
 def test_lost_frames_are_filled_in_between(first: int, count: int) -> None:
     kept = np.delete(np.arange(91), np.arange(first, min(first + count, 90)))
     found = evened(seen_at(TENTH[kept]), TENTH[kept])
-    assert time_step(TENTH[kept], "times") == 0.1
-    assert found.num_steps == 91
+    assert (time_step(TENTH[kept], "times"), found.num_steps) == (0.1, 91)
     assert found.odd == {LOST: f"{91 - len(kept)} of 91"}
     whole = scene()
     np.testing.assert_array_equal(found.position[:, kept], whole.position[:, kept])
@@ -241,8 +232,7 @@ def test_rates_of_recordings(rate: float, whole: bool) -> None:
     rows = Rows(empty, times, empty, empty, np.zeros((len(times), 7)), np.zeros((len(times), 2), bool))
     found, dt, start = stepped(rows)
     assert dt == pytest.approx(1 / rate, rel=2e-4 if whole else 1e-6)
-    assert found.time.tolist() == frames.tolist()
-    assert start == 5000
+    assert (found.time.tolist(), start) == (frames.tolist(), 5000)
 
 
 # Agents and states
@@ -309,8 +299,7 @@ class Lame(FakeReader):
 def test_it_is_counted_by_kind_with_an_example(workers: int, tmp_path: Path) -> None:
     (tmp_path / "a.scene").write_text("straight 1\nstraight 2\nstraight 3\nstraight 4")
     report = convert(Lame(), [tmp_path], tmp_path / "out", workers=workers)
-    assert report.converted == 4
-    assert report.odd == {NO_SIZE: 2, LATE_EGO: 1}
+    assert (report.converted, report.odd) == (4, {NO_SIZE: 2, LATE_EGO: 1})
     assert set(report.odd_examples) == set(report.odd)
     assert report.odd_examples[NO_SIZE].startswith("straight-2: agent ")
     assert report.odd_examples[LATE_EGO] == "straight-4: 2 of 91"

@@ -22,8 +22,7 @@ from symphony.roadgraph import LaneGraph, lane_of, starting_lanes, visited_regio
 def test_regions_of_a_crossing():
     road, name = crossing()
     regions = LaneGraph(road).regions
-    assert len(regions) == 12
-    assert np.unique(regions.parent, return_counts=True)[1].tolist() == [3] * 4
+    assert (len(regions), np.unique(regions.parent, return_counts=True)[1].tolist()) == (12, [3] * 4)
     by_lane = dict(zip(regions.lane.tolist(), range(12), strict=True))
     left, ahead, right = (by_lane[name[f"{k}1"]] for k in ("left", "ahead", "right"))
     assert regions.parent[left] == regions.parent[right] == name["in1"]
@@ -66,8 +65,7 @@ def test_repeated_points_and_connections_change_nothing():
     a, b = LaneGraph(road), LaneGraph(doubled)
     np.testing.assert_array_equal(a.curvature, b.curvature)
     np.testing.assert_array_equal(a.length, b.length)
-    assert a.successors == b.successors
-    assert len(b.regions) == 2
+    assert (a.successors, len(b.regions)) == (b.successors, 2)
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
@@ -256,13 +254,7 @@ def at(line: Reals, along: Reals) -> Reals:
 
 
 @settings(max_examples=30, deadline=None)
-@given(
-    radius=st.floats(12.0, 60.0),
-    speed=st.floats(0.0, 20.0),
-    start=st.floats(0.0, 5.0),
-    seed=st.integers(0, 999),
-    hidden=st.booleans(),
-)
+@given(st.floats(12.0, 60.0), st.floats(0.0, 20.0), st.floats(0.0, 5.0), st.integers(0, 999), st.booleans())
 def test_who_drives_around_a_block_gets_on(radius, speed, start, seed, hidden):
     # Up to two and a half times around: every place is passed again.
     line = bend(1.0, radius)
@@ -285,9 +277,7 @@ def test_on_lines_that_never_come_back_it_is_the_nearest_place(seed: int, steps:
     rng = np.random.default_rng(seed)
     line = np.stack([np.arange(0.0, 190.0, 3.0), 6.0 * np.sin(np.arange(64) / rng.uniform(8, 20))], -1)
     along = np.sort(rng.uniform(-10.0, 200.0, steps))
-    path = (
-        np.stack([along, rng.uniform(-3.0, 3.0, steps)], -1) + [0.0, 1.0] * np.interp(along, *line.T)[:, None]
-    )
+    path = np.stack([along, rng.uniform(-3.0, 3.0, steps) + np.interp(along, *line.T)], -1)
     found = stations_along(line[None], path[None], np.ones((1, steps), bool))[0]
     nearest = shapely.line_locate_point(shapely.LineString(line), shapely.points(path))
     np.testing.assert_allclose(found, nearest, atol=1e-6)
@@ -315,11 +305,7 @@ def test_a_point_that_is_not_finite_is_refused_by_its_place() -> None:
         stations_along(np.stack([bend(0.0)] * 2), path, np.ones((2, 5), bool))
 
 
-@given(
-    arrays(
-        np.float64, st.tuples(st.integers(1, 4), st.integers(1, 12)), elements=st.integers(0, 6).map(float)
-    )
-)
+@given(arrays(float, st.tuples(st.integers(1, 4), st.integers(1, 12)), elements=st.integers(0, 6).map(float)))
 def test_the_earliest_pass_is_a_dip_nearly_as_low_as_any(distance: NDArray[np.float64]) -> None:
     for row, found in zip(distance, earliest_pass(distance), strict=True):
         around = [np.inf, *row, np.inf]

@@ -45,13 +45,9 @@ def test_crossing_has_three_routes_from_each_arm():
     graph = LaneGraph(road)
     for k in range(4):
         found = routes(graph, [(name[f"in{k}"], 10.0)])
-        expected = {
-            (name[f"in{k}"], name[f"left{k}"], name[f"out{(k + 3) % 4}"]),
-            (name[f"in{k}"], name[f"ahead{k}"], name[f"out{(k + 2) % 4}"]),
-            (name[f"in{k}"], name[f"right{k}"], name[f"out{(k + 1) % 4}"]),
-        }
-        assert set(lanes_of(found)) == expected
-        assert found == sorted(found)
+        ways = enumerate(("right", "ahead", "left"), start=1)
+        expected = {(name[f"in{k}"], name[f"{way}{k}"], name[f"out{(k + to) % 4}"]) for to, way in ways}
+        assert (set(lanes_of(found)), found) == (expected, sorted(found))
 
 
 def test_roundabout_ends_by_the_horizon():
@@ -64,10 +60,8 @@ def test_roundabout_ends_by_the_horizon():
         reach = graph.length[list(route)].sum()
         assert reach >= 200 or not graph.successors[route[-1]]
         assert reach - graph.length[route[-1]] < 200
-    assert any(
-        len(set(route)) < len(route)
-        for route in lanes_of(routes(graph, [(name["entry0"], 0.0)], horizon=400))
-    )
+    longer = lanes_of(routes(graph, [(name["entry0"], 0.0)], horizon=400))
+    assert any(len(set(route)) < len(route) for route in longer)
 
 
 def test_limit_keeps_every_near_branch():
@@ -111,11 +105,8 @@ def test_parallel_lanes_offer_one_change_not_one_per_piece():
     graph = LaneGraph(road)
     for own, other in ("ab", "ba"):
         found = routes(graph, [(name[f"{own}0"], 5.0)])
-        plain = Route((name[f"{own}0"], name[f"{own}1"], name[f"{own}2"]))
-        changed = Route(
-            (name[f"{own}0"], name[f"{other}0"], name[f"{other}1"], name[f"{other}2"]), 1, 5.0, 5.0
-        )
-        assert found == [plain, changed]
+        mine, others = ([name[f"{side}{k}"] for k in range(3)] for side in (own, other))
+        assert found == [Route(tuple(mine)), Route((mine[0], *others), 1, 5.0, 5.0)]
     assert len(routes(graph, [(name["a0"], 5.0), (name["b0"], 5.0)])) == 2
 
 
@@ -216,11 +207,10 @@ def test_lanes_that_do_not_meet_are_joined_without_a_jump(gap):
 def maps():
     """Graphs with every kind of junction and of change, each with the lanes it is entered by."""
     entries = {
-        crossing: "in0 in1", roundabout: "entry0 between1", pocket: "first second", parallel: "a0 b1",
-        merge: "a b",
+        crossing: "in0 in1", roundabout: "entry0 between1", pocket: "first second", parallel: "a0 b1", merge: "a b",
     }  # fmt: skip
-    made = [(make(), names.split()) for make, names in entries.items()]
-    return [(road, [name[entry] for entry in names]) for (road, name), names in made]
+    made = [(*make(), names.split()) for make, names in entries.items()]
+    return [(road, [name[entry] for entry in names]) for road, name, names in made]
 
 
 def own_sharpest(graph, lanes):
@@ -252,11 +242,8 @@ def test_routes_can_be_driven(which, share, speed):
         lanes = shapely.union_all([shapely.LineString(each) for each in graph.lines])
         assert shapely.distance(lanes, shapely.points(line)).max() < 1.8
         if route.change:
-            over = arc_lengths(line) > (
-                arc_lengths(line)[0]
-                + graph.length[list(route.lanes[: route.change])].sum()
-                + change_length(speed)
-            )
+            way = graph.length[list(route.lanes[: route.change])].sum() + change_length(speed)
+            over = arc_lengths(line) > arc_lengths(line)[0] + way
             after = shapely.union_all([shapely.LineString(graph.lines[k]) for k in parts[1]])
             assert shapely.distance(after, shapely.points(line[over])).max(initial=0.0) < 0.2
     # No two are the same within a metre, and of a standing vehicle all changes are 20 m long.

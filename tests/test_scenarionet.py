@@ -32,8 +32,7 @@ def test_tracks(tmp_path: Path) -> None:
     assert (segment.dt, segment.num_steps, segment.ego) == (0.1, STEPS, 1)
     assert segment.agent_id.tolist() == [0, 1, 2, 3]
     kinds = [AgentType.VEHICLE, AgentType.VEHICLE, AgentType.OTHER, AgentType.PEDESTRIAN]
-    assert segment.agent_type.tolist() == kinds
-    assert segment.valid[0].tolist() == [k >= 3 for k in range(STEPS)]
+    assert (segment.agent_type.tolist(), segment.valid[0].tolist()) == (kinds, [k >= 3 for k in range(STEPS)])
     np.testing.assert_allclose(segment.size[[0, 3]], [(4.5, 2, 1.6), (0.7, 0.6, 1.8)], rtol=1e-6)
     np.testing.assert_array_equal(segment.origin, (*FAR, 0))
     np.testing.assert_allclose(segment.position[1, 10], (10, 0, 0.9), rtol=1e-6)
@@ -65,13 +64,9 @@ def test_what_is_derived_of_the_map(tmp_path: Path) -> None:
 
 def test_successors_begin_where_a_lane_ends(tmp_path: Path) -> None:
     for points, succeeds in (
-        (((40, 0), (60, 0)), True),
-        (((40.3, 0.3), (60, 0)), True),
-        (((40.6, 0), (60, 0)), False),
-        (((40, 0), (50, 10)), True),
-        (((40, 0), (45, 10)), False),
-        (((40, 0), (20, 0.5)), False),
-    ):
+        (((40, 0), (60, 0)), True), (((40.3, 0.3), (60, 0)), True), (((40.6, 0), (60, 0)), False),
+        (((40, 0), (50, 10)), True), (((40, 0), (45, 10)), False), (((40, 0), (20, 0.5)), False),
+    ):  # fmt: skip
         tree = scenario()
         tree["map_features"]["on"]["polyline"] = line(*points)
         found = read_one("scenarionet", write(tmp_path, tree)).road.successors.tolist()
@@ -181,14 +176,12 @@ STATE, LINE, LIGHTS = "tracks/ego/state/", "map_features/on/polyline", "dynamic_
 
 
 @pytest.mark.parametrize(("path", "value", "field"), [
-    ("id", 7, "id"), ("metadata", ..., "metadata"),
-    ("metadata/ts", np.arange(STEPS) ** 2 * 0.1, "metadata: ts"),
+    ("id", 7, "id"), ("metadata", ..., "metadata"), ("metadata/ts", np.arange(STEPS) ** 2 * 0.1, "metadata: ts"),
     ("metadata/ts", np.full(STEPS, np.nan), "metadata: ts"), ("length", 7, "metadata"),
     ("metadata/sdc_id", "never", "metadata: sdc_id"), ("metadata/map", "\ud800", "group"),
     ("tracks", {}, "tracks"), ("metadata/ts", (np.arange(STEPS) / 10).astype(str), "metadata"),
     ("metadata/ts", np.zeros((STEPS, 2)), "metadata"), (STATE + "heading", np.zeros(2 * STEPS), "tracks ego"),
-    (STATE + "heading", np.zeros((STEPS, 2)), "tracks ego"),
-    (STATE + "position", np.zeros((STEPS, 2)), "tracks ego"),
+    (STATE + "heading", np.zeros((STEPS, 2)), "tracks ego"), (STATE + "position", np.zeros((STEPS, 2)), "tracks ego"),
     (STATE + "position", np.zeros((3, STEPS)), "tracks ego"),
     (STATE + "heading", np.array(STEPS * ["a"]), "tracks ego"),
     (STATE + "heading", np.full(STEPS, np.inf), "heading"), (LINE, [[[1], [2]]], "map_features on"),
@@ -219,16 +212,9 @@ ARRAYS = arrays.arrays(
     st.sampled_from([np.dtype(name) for name in ("<f8", ">f4", "<i8", "|u1", "|b1", "<U3", "|S4")]),
     arrays.array_shapes(max_dims=3, max_side=4, min_side=0),
 )
-TREES = st.recursive(
-    SCALARS | ARRAYS | st.binary(max_size=5),
-    lambda inner: (
-        st.lists(inner, max_size=4)
-        | st.tuples(inner, inner)
-        | st.dictionaries(st.text(max_size=4), inner, max_size=4)
-        | st.sets(st.integers(), max_size=3)
-    ),
-    max_leaves=12,
-)
+TREES = st.recursive(SCALARS | ARRAYS | st.binary(max_size=5) | st.sets(st.integers(), max_size=3), lambda inner: (
+    st.lists(inner, max_size=4) | st.tuples(inner, inner) | st.dictionaries(st.text(max_size=4), inner, max_size=4)
+), max_leaves=12)  # fmt: skip
 
 
 def load(data: bytes, folder: Path) -> Any:
@@ -320,46 +306,30 @@ def array_pickle(shape: Any, data: Any, kind: str = "f8", order: Any = "<") -> b
 def test_arrays_that_lie_are_refused(tmp_path: Path) -> None:
     eight = b"12345678"
     for message, *made in (
-        ("impossible shape", (10**12,), b""),
-        ("impossible shape", (-1,), b""),
-        ("impossible shape", (2.0,), 2 * eight),
-        ("impossible shape", (True,), eight),
-        ("in 8 bytes", (10**5,) * 8, eight),
-        ("without a shape", (0,) * 99, b""),
-        ("without a shape", [1], eight),
-        ("in 8 bytes", (2,), eight),
-        ("of objects", (1,), "12345678"),
-        ("of objects", (1,), [1.0]),
-        ("of type 'O'", (1,), eight, "O"),
-        ("of type", (1,), eight, "f8,f8"),
-        ("structured", (1,), eight, "f8", "!"),
-    ):
+        ("impossible shape", (10**12,), b""), ("impossible shape", (-1,), b""),
+        ("impossible shape", (2.0,), 2 * eight), ("impossible shape", (True,), eight),
+        ("in 8 bytes", (10**5,) * 8, eight), ("without a shape", (0,) * 99, b""), ("without a shape", [1], eight),
+        ("in 8 bytes", (2,), eight), ("of objects", (1,), "12345678"), ("of objects", (1,), [1.0]),
+        ("of type 'O'", (1,), eight, "O"), ("of type", (1,), eight, "f8,f8"), ("structured", (1,), eight, "f8", "!"),
+    ):  # fmt: skip
         assert message in refused(array_pickle(*made), tmp_path)
 
 
-RAW = [
-    (b"", "empty"),
-    (pickle.dumps([1, 2])[:-1], "not a pickle"),
-    (b"\xff" * 100, "not a pickle"),
+@pytest.mark.parametrize(("data", "message"), [
+    (b"", "empty"), (pickle.dumps([1, 2])[:-1], "not a pickle"), (b"\xff" * 100, "not a pickle"),
     (b"\x80\x04)\x81.", "NEWOBJ"),  # an object of a class
-    (pickle.dumps([1], 2), "protocol 2; 4 and 5 are read"),
-    (b"Pabc\n.", "PERSID"),
+    (pickle.dumps([1], 2), "protocol 2; 4 and 5 are read"), (b"Pabc\n.", "PERSID"),
     (b"\x80\x04B\xff\xff\xff\x7fabc.", "not a pickle"),  # more bytes than there are
     (b"\x80\x05\x96\xff\xff\xff\xff\xff\x00\x00\x00abc.", "not a pickle"),
     (b"\x80\x04\x8c\x05numpy\x8c\x0bos.path.sep\x93.", "refers to numpy.os.path.sep"),
-]
-
-
-@pytest.mark.parametrize(("data", "message"), RAW)
+])  # fmt: skip
 def test_raw_programs_are_refused(data: bytes, message: str, tmp_path: Path) -> None:
     assert message in refused(data, tmp_path)
 
 
 def test_too_large_files_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for limit, message in (
-        ("MAX_BYTES", "at most 99: too large"),
-        ("MAX_OPCODES", "more than 99 instructions"),
-    ):
+    limits = {"MAX_BYTES": "at most 99: too large", "MAX_OPCODES": "more than 99 instructions"}
+    for limit, message in limits.items():
         with monkeypatch.context() as patch:
             patch.setattr(safe_pickle, limit, 99)
             assert message in refused(pickle.dumps(list(range(200))), tmp_path)

@@ -94,19 +94,14 @@ def test_indices_and_codes_stay_inside(name: str) -> None:
 @pytest.mark.parametrize("name", ["road.lanes", "road.boundary", "road.marks"])
 def test_polylines_are_checked(name: str) -> None:
     points, offsets = held(name).points, held(name).offsets
+    for wrong in (put(points, np.nan), points[:, :2], points.astype(np.float64)):
+        assert refused(changed(name, Polylines(wrong, offsets))) == name
     for wrong in (
-        Polylines(put(points, np.nan), offsets),
-        Polylines(points, offsets + 1),
-        Polylines(points, put(offsets, offsets[-1] - 1)),
-        Polylines(points, put(offsets, offsets[-1] + 1)),
-        Polylines(points, offsets.astype(np.int32)),
-        Polylines(points[:, :2], offsets),
-        Polylines(points.astype(np.float64), offsets),
-        Polylines(points, offsets[[0, 0, *range(1, len(offsets))]]),  # a line of no points
-        # Once around: all differences are positive.
-        Polylines(points, np.array([0, 2**63 - 1, -2, len(points)], np.int64)),
-    ):
-        assert refused(changed(name, wrong)) == name
+        offsets + 1, put(offsets, offsets[-1] - 1), put(offsets, offsets[-1] + 1), offsets.astype(np.int32),
+        offsets[[0, 0, *range(1, len(offsets))]],  # a line of no points
+        np.array([0, 2**63 - 1, -2, len(points)], np.int64),  # once around: all differences are positive
+    ):  # fmt: skip
+        assert refused(changed(name, Polylines(points, wrong))) == name
 
 
 def moved(position: NDArray[Any], metres: float) -> NDArray[Any]:
@@ -129,20 +124,12 @@ def across(times: int) -> RunSegment:
 
 @pytest.mark.parametrize(("name", "value"), [
     *(("segment_id", text) for text in ("a/b", "", "a\x1b[31m")),
-    *(("dt", dt) for dt in (0.0, float("nan"), -0.1, 0.001)),
-    *(("ego", ego) for ego in (-1, 4)),
-    *(("current_step", step) for step in (6, -1)),
-    ("agent_id", np.zeros(4, np.int64)),
+    *(("dt", dt) for dt in (0.0, float("nan"), -0.1, 0.001)), *(("ego", ego) for ego in (-1, 4)),
+    *(("current_step", step) for step in (6, -1)), ("agent_id", np.zeros(4, np.int64)),
     *(("size", np.full((4, 3), side, np.float32)) for side in (0, 101, 1e-3)),
-    ("position", np.full((4, 6, 3), 20_001, np.float32)),
-    ("velocity", FULL.velocity + np.float32(3e38)),
-    ("heading", FULL.heading + np.float32(2e3)),
-    ("valid", np.ones(6, bool)),
-    ("valid", np.ones((4, 10_001), bool)),
-    ("origin", FULL.origin + 1e30),
-    ("group", "\ud800"),
-    ("file", "x" * 300),
-    ("source", "\udc80"),
+    ("position", np.full((4, 6, 3), 20_001, np.float32)), ("velocity", FULL.velocity + np.float32(3e38)),
+    ("heading", FULL.heading + np.float32(2e3)), ("valid", np.ones(6, bool)), ("valid", np.ones((4, 10_001), bool)),
+    ("origin", FULL.origin + 1e30), ("group", "\ud800"), ("file", "x" * 300), ("source", "\udc80"),
     ("road.speed_limit", np.full(3, 1e6, np.float32)),
 ])  # fmt: skip
 def test_faults_are_named(name: str, value: Any) -> None:
@@ -150,8 +137,7 @@ def test_faults_are_named(name: str, value: Any) -> None:
 
 
 def test_faults_of_more_than_one_field_are_named() -> None:
-    assert refused(FULL.replace(valid=np.zeros((4, 6), bool))) == "ego"
-    assert refused(across(170)) == "road"
+    assert (refused(FULL.replace(valid=np.zeros((4, 6), bool))), refused(across(170))) == ("ego", "road")
     jumping = straight_road(3, steps=8)
     assert refused(jumping.replace(position=moved(jumping.position, 5000))) == "position"
     for name, metres in (("road.lanes", 1e30), ("road.boundary", 30_000), ("road.marks", 1e6)):

@@ -27,9 +27,8 @@ BESIDE = NORTH + np.asarray([3.5, 0])
 ONCOMING = NORTH[::-1] + np.asarray([-3.5, 0])
 TURN_IN = np.asarray([(-100, 10), *zip(-10 + 10 * np.sin(ARC), 20 - 10 * np.cos(ARC), strict=True), (0, 200)])
 """From the west into NORTH, which it reaches at y = 20, 100.7 m on."""
-TURN_OFF = np.asarray(
-    [(0, -200), *zip(10 * np.cos(ARC) - 10, 10 * np.sin(ARC) - 20, strict=True), (-200, -10)]
-)
+OFF = zip(10 * np.cos(ARC) - 10, 10 * np.sin(ARC) - 20, strict=True)
+TURN_OFF = np.asarray([(0, -200), *OFF, (-200, -10)])
 CREEP = np.minimum(0.5 * TIME, 4)
 CHANGE_LANE = np.asarray([[3.5, -200], [3.5, -30], [0, 0], [0, 200]])
 
@@ -85,17 +84,14 @@ CASES = {name: (context, paths) for context, found in BY_CONTEXT.items() for nam
 def test_the_context_is_what_happens(case: str) -> None:
     context, paths = CASES[case]
     choice = interactive_choice(scene(paths), 2)
-    assert choice.context == context
-    assert choice.agents.tolist() == [0, 1]
+    assert (choice.context, choice.agents.tolist()) == (context, [0, 1])
 
 
 @settings(max_examples=30, deadline=None)
 @given(
-    st.sampled_from(sorted(CASES)),
-    st.floats(-np.pi, np.pi),
-    st.tuples(st.floats(-500, 500), st.floats(-500, 500)),
-    st.randoms(use_true_random=False),
-)
+    st.sampled_from(sorted(CASES)), st.floats(-np.pi, np.pi),
+    st.tuples(*[st.floats(-500, 500)] * 2), st.randoms(use_true_random=False),
+)  # fmt: skip
 def test_frame_and_order_do_not_matter(case: str, angle: float, shift: Any, random: Any) -> None:
     context, paths = CASES[case]
     segment = scene(paths)
@@ -109,13 +105,7 @@ def test_frame_and_order_do_not_matter(case: str, angle: float, shift: Any, rand
 
 
 @settings(max_examples=30, deadline=None)
-@given(
-    st.floats(3, 25),
-    st.floats(3, 25),
-    st.floats(np.deg2rad(40), np.deg2rad(140)),
-    st.booleans(),
-    st.floats(-8, 8),
-)
+@given(*[st.floats(3, 25)] * 2, st.floats(np.deg2rad(40), np.deg2rad(140)), st.booleans(), st.floats(-8, 8))
 def test_crossing_is_a_matter_of_time(speed, other_speed, angle, right, gap):
     """Whatever the speeds and the angle, two that pass one place within the limit cross."""
     # The place is as wide as half a step and half a metre of either: at an acute angle a slow one needs time for it.
@@ -144,9 +134,8 @@ def test_relations_are_mutual(seed: int, make: Any) -> None:
     for other in range(1, 5):
         here = relations(segment, np.asarray([other]))
         there = relations(segment.replace(ego=other), np.asarray([0]))
-        assert np.isfinite(here.leader[0]) == np.isfinite(there.follower[0])
-        assert np.isfinite(here.follower[0]) == np.isfinite(there.leader[0])
-        assert np.isfinite(here.crossing[0]) == np.isfinite(there.crossing[0])
+        for one, two in (("leader", "follower"), ("follower", "leader"), ("crossing", "crossing")):
+            assert np.isfinite(getattr(here, one)[0]) == np.isfinite(getattr(there, two)[0])
 
 
 def test_a_partner_that_is_seen_throughout_goes_first() -> None:
@@ -202,8 +191,7 @@ def test_marks_of_the_source_come_first() -> None:
 def test_the_order_of_agents_does_not_matter(random: Any, count: int, make: Any) -> None:
     segment = make(num_agents=9, seed=random.randrange(1000))
     chosen = interactive_agents(segment, count)
-    assert len(set(chosen.tolist())) == count
-    assert chosen[0] == segment.ego
+    assert (len(set(chosen.tolist())), chosen[0]) == (count, segment.ego)
     order = random.sample(range(9), 9)
     arrays = ("agent_id", "agent_type", "size", "position", "heading", "velocity", "valid")
     mixed = segment.replace(ego=order.index(0), **{name: getattr(segment, name)[order] for name in arrays})
@@ -230,7 +218,5 @@ def test_too_few_crowds_and_large_maps_are_left_out() -> None:
     assert [excluded(crowd, 2), excluded(crowd, 3), excluded(unseen, 2)] == ["playback_agents", "", ""]
     # By its length, not by how densely it is drawn.
     assert contexts.road_points(with_lane(100, 0.1)) == contexts.road_points(with_lane(100, 50)) == 51
-    assert [excluded(with_lane(*size), 2) for size in ((19_990, 0.5), (20_010, 50))] == [
-        "",
-        "roadgraph_points",
-    ]
+    found = [excluded(with_lane(*size), 2) for size in ((19_990, 0.5), (20_010, 50))]
+    assert found == ["", "roadgraph_points"]

@@ -51,8 +51,7 @@ def test_round_trip(found: list[RunSegment], split: int) -> None:
         fill(path, found[:split])
         fill(path, found[split:], append=True)
         store = SegmentStore(path)
-        assert hashes(store) == hashes(found)
-        assert store.ids == [s.segment_id for s in found]
+        assert (hashes(store), store.ids) == (hashes(found), [s.segment_id for s in found])
         for i, segment in enumerate(found):
             assert store.index_of(segment.segment_id) == i
             assert content_hash(store[i - len(found)]) == content_hash(segment)
@@ -114,10 +113,8 @@ def test_checksum_ignores_order_and_layout_and_report(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("change", "field"), [
-    ({"dt": -1.0}, "dt"),
-    ({"agent_id": np.arange(3, dtype=np.int32)}, "agent_id"),
-    ({"heading": np.full((3, 51), np.nan, np.float32)}, "heading"),
-    ({"segment_id": "r0"}, "segment_id"),
+    ({"dt": -1.0}, "dt"), ({"agent_id": np.arange(3, dtype=np.int32)}, "agent_id"),
+    ({"heading": np.full((3, 51), np.nan, np.float32)}, "heading"), ({"segment_id": "r0"}, "segment_id"),
 ])  # fmt: skip
 def test_what_is_refused_leaves_no_trace(folder: Path, change: dict[str, Any], field: str) -> None:
     found = unlike(3)
@@ -275,10 +272,8 @@ def change(path: Path, offset: int, data: bytes) -> None:
 def test_unknown_headers_are_refused(filled: Path) -> None:
     for text, message in (
         ('{"format": "symphony segment store", "version": 2}', "reads a symphony segment store of version 1"),
-        ('{"format": "zarr", "version": 1}', "is 'zarr'"),
-        ("{", "not valid JSON"),
-        ("[]", "not a JSON object"),
-    ):
+        ('{"format": "zarr", "version": 1}', "is 'zarr'"), ("{", "not valid JSON"), ("[]", "not a JSON object"),
+    ):  # fmt: skip
         (filled / "store.json").write_text(text)
         for use in (SegmentStore, lambda path: StoreWriter(path, append=True)):
             with pytest.raises(DataError, match=message):
@@ -357,11 +352,9 @@ def rehash(filled: Path) -> None:
 
 
 @pytest.mark.parametrize(("column", "data", "field"), [
-    ("heading", np.float32(np.nan).tobytes(), "heading"),
-    ("agent_type", b"\x77", "agent_type"),
+    ("heading", np.float32(np.nan).tobytes(), "heading"), ("agent_type", b"\x77", "agent_type"),
     ("lanes.points", np.float32(1e30).tobytes(), "road.lanes"),
-    ("lanes.offsets", np.int64(7).tobytes(), "road.lanes"),
-    ("successors", np.int32(-5).tobytes(), "road.successors"),
+    ("lanes.offsets", np.int64(7).tobytes(), "road.lanes"), ("successors", np.int32(-5).tobytes(), "road.successors"),
 ])  # fmt: skip
 def test_what_breaks_the_schema_is_refused(filled: Path, column: str, data: bytes, field: str) -> None:
     change(filled / "columns" / f"{column}.bin", 0, data)

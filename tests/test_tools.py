@@ -6,7 +6,7 @@ import importlib.util
 import os
 import sys
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,9 @@ from helpers_segments import straight_road
 from helpers_skips import by_kind, grown
 from symphony.data.sources import readers
 
-pytestmark = pytest.mark.skipif(
-    not sys.platform.startswith("linux"), reason="memory is limited on Linux only"
-)
-if sys.platform.startswith("linux"):
+LINUX = sys.platform.startswith("linux")
+pytestmark = pytest.mark.skipif(not LINUX, reason="memory is limited on Linux only")
+if LINUX:
     import fuzz
     import kills
     from fuzz import BAD, Counts, attempt, inputs, run
@@ -108,17 +107,9 @@ def count(out: Path, careful: bool) -> None:
                 file.write(str(k))
 
 
-def careful(out: Path) -> None:
-    count(out, True)
-
-
-def careless(out: Path) -> None:
-    count(out, False)
-
-
-@pytest.mark.parametrize(("work", "good"), [(careful, True), (careless, False)])
-def test_what_is_lost_or_comes_twice(work: Callable[[Path], None], good: bool, tmp_path: Path) -> None:
-    counts = torment(kills.Target(work, files), tmp_path, 3, seed=0)
+@pytest.mark.parametrize("good", [True, False])
+def test_what_is_lost_or_comes_twice(good: bool, tmp_path: Path) -> None:
+    counts = torment(kills.Target(partial(count, careful=good), files), tmp_path, 3, seed=0)
     assert counts.kills >= 3
     assert counts.finished >= 1
     assert (counts.failed == []) == good
@@ -133,16 +124,12 @@ def test_work_that_fails_is_told(tmp_path: Path) -> None:
 
 def test_more_than_are_written_down_are_told() -> None:
     counts = by_kind(["Skipped: no CUDA device"] * 3 + ["Skipped: lazy"])
-    assert counts == {"a card": 3, "Skipped: lazy": 1}
-    assert grown(counts, "3 a card\n1 Skipped: lazy\n") == []
-    told = grown(counts, "2 a card\n")
-    assert [line.partition(", ")[0] for line in told] == [
-        "3 tests skipped for want of a card",
-        "1 tests skipped for want of Skipped: lazy",
-    ]
+    assert (counts, grown(counts, "3 a card\n1 Skipped: lazy\n")) == ({"a card": 3, "Skipped: lazy": 1}, [])
+    told = [line.partition(", ")[0] for line in grown(counts, "2 a card\n")]
+    assert told == [f"{found} tests skipped for want of {why}" for why, found in counts.items()]
 
 
-def tested(folder: Path, watched: str) -> int:
+def ran(folder: Path, watched: str) -> int:
     """Run the tests of a folder with its own conftest; the status."""
     forget("conftest")
     os.environ["SYMPHONY_SKIPS"] = watched
@@ -153,7 +140,7 @@ def tested(folder: Path, watched: str) -> int:
 def test_an_unknown_skip_fails_where_it_is_watched(tmp_path: Path, watched: str, status: int) -> None:
     (tmp_path / "conftest.py").write_text((HERE / "conftest.py").read_text())
     (tmp_path / "test_it.py").write_text("import pytest\n\ndef test_it():\n    pytest.skip('lazy')\n")
-    process = apart(tested, tmp_path, watched, said=tmp_path / "said")
+    process = apart(ran, tmp_path, watched, said=tmp_path / "said")
     process.join()
     said = (tmp_path / "said").read_text()
     assert process.exitcode == status, said

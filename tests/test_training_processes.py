@@ -33,9 +33,8 @@ from symphony.training.processes import Processes, processes
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("data") / "store"
-    fill(path, [straight_road(4, seed=0, steps=10), crossing(4, seed=0, steps=9)])
-    return path
+    found = [straight_road(4, steps=10), crossing(4, steps=9)]
+    return fill(tmp_path_factory.mktemp("data") / "store", found).path
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +69,7 @@ def test_a_run_that_was_killed_at_many_a_moment_ends_like_one_that_was_not(store
     assert records(part) == records(whole)
     assert [r["step"] for r in records(whole)] == list(range(1, helpers_killed.STEPS + 1))
     assert choose(part, "best").name == choose(whole, "best").name
-    left = [p.relative_to(part) for p in part.rglob("*") if p.name.startswith(".")]
-    assert left == []
+    assert not list(part.rglob(".*"))
 
 
 def test_searches_made_as_one_are_learned_from_in_turn(store, tmp_path):
@@ -169,9 +167,8 @@ def test_two_processes_on_one_run_are_refused_and_the_lock_dies_with_its_process
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
-        with pytest.raises(
-            DataError, match=rf"part: is being written by another process: {other.pid} on .*: -c "
-        ):
+        who = rf"part: is being written by another process: {other.pid} on .*: -c "
+        with pytest.raises(DataError, match=who):
             train(settings)
         assert (learned(part), records(part)) == (before, records(run))
         other.kill()

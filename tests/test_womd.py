@@ -132,8 +132,7 @@ def test_lanes_without_points_and_edges_of_one_go_with_all_that_refers_to_them(p
     (lambda s: s.ClearField("scenario_id"), "scenario_id"),
     (lambda s: s.timestamps_seconds.__setitem__(2, 0.9), "timestamps_seconds"),
     (lambda s: s.timestamps_seconds.__setitem__(2, np.nan), "timestamps_seconds"),
-    (lambda s: s.ClearField("tracks"), "tracks"),
-    (lambda s: s.tracks[0].states.pop(), "tracks.states"),
+    (lambda s: s.ClearField("tracks"), "tracks"), (lambda s: s.tracks[0].states.pop(), "tracks.states"),
     (lambda s: setattr(s.tracks[1], "object_type", 9), "tracks.object_type"),
     (lambda s: setattr(s, "sdc_track_index", 3), "sdc_track_index"),
     (lambda s: [setattr(x, "valid", False) for x in s.tracks[2].states], "sdc_track_index"),
@@ -153,8 +152,7 @@ def test_what_is_forbidden_is_named(path: Path, change: Change, field: str) -> N
     change(scenario)
     write_records(path, [scenario.SerializeToString()])
     error = read_error("womd", path)
-    assert error.file == path
-    assert str(error.field).removeprefix("record 0, ") == field
+    assert (error.file, str(error.field).removeprefix("record 0, ")) == (path, field)
     assert error.segment == (scenario.scenario_id or None)
 
 
@@ -173,8 +171,7 @@ def test_single_odd_things_are_left_out(path: Path, change: Change, kind: str) -
     found = convert(path, scenario)
     assert list(found.odd) == [kind]
     lines = [len(each.road.lanes) + len(each.road.boundary) for each in (whole, found)]
-    assert lines[0] - lines[1] == (kind == NO_LINE)
-    assert whole.num_agents - found.num_agents == (kind == NO_SIZE)
+    assert (lines[0] - lines[1], whole.num_agents - found.num_agents) == (kind == NO_LINE, kind == NO_SIZE)
     if kind == WILD:
         assert np.argwhere(~found.valid).tolist() == [[0, 2]]
 
@@ -217,24 +214,20 @@ def test_a_real_record(real: RunSegment, summary: dict[str, Any]) -> None:
     limits = [lane["speed_limit_mph"] * MPS or np.nan for lane in lanes]
     np.testing.assert_allclose(real.road.speed_limit, limits, rtol=1e-6)
     index = {lane["id"]: k for k, lane in enumerate(lanes)}
-    left, right = (
+    beside = (
         [[n["feature_id"] for n in lane[f"{side}_neighbors"]] for lane in lanes] for side in ("left", "right")
     )
-    for found, named in (
-        (real.road.successors, [lane["exit_lanes"] for lane in lanes]),
-        (real.road.successors[:, ::-1], [lane["entry_lanes"] for lane in lanes]),
-        (real.road.left_neighbors, left),
-        (real.road.right_neighbors, right),
-    ):
-        assert set(map(tuple, found.tolist())) == {
-            (k, index[i]) for k, ids in enumerate(named) for i in ids if i in index
-        }
+    ways = ([lane[f"{way}_lanes"] for lane in lanes] for way in ("exit", "entry"))
+    road, nexts = real.road, real.road.successors
+    pairs = (nexts, nexts[:, ::-1], road.left_neighbors, road.right_neighbors)
+    for found, named in zip(pairs, (*ways, *beside), strict=True):
+        links = {(k, index[i]) for k, ids in enumerate(named) for i in ids if i in index}
+        assert set(map(tuple, found.tolist())) == links
     edges = [feature for feature in summary["map_features"] if feature["kind"] == "road_edge"]
     for lines, expected in ((real.road.lanes, lanes), (real.road.boundary, edges)):
         np.testing.assert_array_equal(np.diff(lines.offsets), [line["n_points"] for line in expected])
-        np.testing.assert_allclose(
-            lines.points[lines.offsets[:-1]] + real.origin, [line["first"] for line in expected], atol=2e-5
-        )
+        first = lines.points[lines.offsets[:-1]] + real.origin
+        np.testing.assert_allclose(first, [line["first"] for line in expected], atol=2e-5)
     rows = {lane: k for k, lane in enumerate(real.road.lane_id[real.signal_lane].tolist())}
     states = np.zeros((12, 91), np.uint8)
     for step, lights in enumerate(summary["dynamic_map_states"]):

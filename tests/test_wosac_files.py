@@ -22,6 +22,7 @@ from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import WosacSettings
 from symphony.errors import DataError, SymphonyError
+from symphony.wosac import check_submission, write_submission
 from symphony.wosac import wosac_pb2 as pb
 from symphony.wosac.files import read_rollouts, score_files
 from symphony.wosac.meta import SubmissionMeta
@@ -29,15 +30,7 @@ from symphony.wosac.records import logged_scenario, read_scenarios, simulated_id
 from symphony.wosac.scorer import CHALLENGES, score
 from symphony.wosac.scorer.scenario import STATES
 from symphony.wosac.simulate import simulated_scenarios
-from symphony.wosac.submission import (
-    FIELDS,
-    check_submission,
-    meta_message,
-    required_agents,
-    scenario_message,
-    shard_name,
-    write_submission,
-)
+from symphony.wosac.submission import FIELDS, meta_message, required_agents, scenario_message, shard_name
 
 NAMES = ("aaaa", "bbbb", "cccc")
 
@@ -84,8 +77,7 @@ def test_scores_of_scenarios(tmp_path, monkeypatch):
     for name in expected:
         assert found[name] == pytest.approx(np.mean([part[name] for part in found["scenarios"]]))
     # What a scenario scores does not depend on those before it: the first one comes again.
-    assert first == last
-    assert [part["object_id"] for part in first["objects"]] == [100, 102]
+    assert (first, [part["object_id"] for part in first["objects"]]) == (last, [100, 102])
     # The folder of the scenario file, and a pattern, mean the same; so do two workers.
     for scenario, how in ((tmp_path, ()), (tmp_path / "*.tfrecord", ("--workers", "2"))):
         assert run(scenario, many[1], "--json", again, *more, *how) == 0
@@ -114,8 +106,7 @@ def without_future(record):
 
 
 @pytest.mark.parametrize(("change", "why"), [
-    (without_edges, "no road edge"),
-    (without_vehicles, "time_to_collision"),
+    (without_edges, "no road edge"), (without_vehicles, "time_to_collision"),
     (without_future, "valid at no step that could be scored"),
 ])  # fmt: skip
 def test_a_scenario_that_cannot_be_scored_ends_no_others(change, why, tmp_path, refused, capsys):
@@ -269,7 +260,6 @@ def archive(shards):
 
 
 def found_in(content, required=AGENTS):
-    """The problems of an archive."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "some.tar.gz")
         path.write_bytes(content)
@@ -289,7 +279,6 @@ def named(shards):
 
 @pytest.fixture
 def shards():
-    """Those of a good submission, to be changed."""
     return [Shard.FromString(content) for content in GOOD]
 
 
@@ -371,7 +360,7 @@ def scene(shards):
     return shards[0].scenario_rollouts[1].joint_scenes[2]
 
 
-def trajectory(shards):
+def track(shards):
     return scene(shards).simulated_trajectories[1]
 
 
@@ -388,11 +377,11 @@ def put(field, value=None):
     (lambda s: s[0].scenario_rollouts[1].joint_scenes.pop(), ["segment cccc, field joint_scenes: 31 rollouts"]),
     (lambda s: scene(s).simulated_trajectories.pop(), ["cccc, field object_id: rollout 2: agent 102 missing"]),
     (lambda s: scene(s).ClearField("simulated_trajectories"), ["rollout 2: agents 100, 101, 102 missing"]),
-    (lambda s: setattr(trajectory(s), "object_id", 777), ["rollout 2: agent 101 missing"]),
-    (lambda s: setattr(trajectory(s), "object_id", 100), ["rollout 2: agent 100 more than once"]),
+    (lambda s: setattr(track(s), "object_id", 777), ["rollout 2: agent 101 missing"]),
+    (lambda s: setattr(track(s), "object_id", 100), ["rollout 2: agent 100 more than once"]),
     (lambda s: scene(s).simulated_trajectories.add(object_id=7), ["agent 7 in the rollouts, but not valid"]),
-    (lambda s: trajectory(s).center_x.pop(), ["cccc, field center_x: rollout 2: agent 101: 79 steps"]),
-    (lambda s: trajectory(s).center_z.__setitem__(3, np.inf), ["field center_z: rollout 2: agent 101, step 14: not"]),
+    (lambda s: track(s).center_x.pop(), ["cccc, field center_x: rollout 2: agent 101: 79 steps"]),
+    (lambda s: track(s).center_z.__setitem__(3, np.inf), ["field center_z: rollout 2: agent 101, step 14: not"]),
     (put("submission_type", 2), ["field submission_type: is 2"] * 2),
     (put("account_name"), ["field account_name: "] * 2),
     (put("unique_method_name", " "), ["field unique_method_name: missing"] * 2),
@@ -411,7 +400,7 @@ def test_broken_submissions(shards, change, texts):
 
 def test_without_the_scenarios_rollouts_are_compared_with_each_other(shards):
     assert found_in(archive(named(shards)), None) == []
-    trajectory(shards).object_id = 777
+    track(shards).object_id = 777
     assert "agent 101 missing" in found_in(archive(named(shards)), None)[0]
 
 
@@ -438,7 +427,6 @@ def test_a_shard_that_is_no_message(wrong):
 
 
 def unzipped(content):
-    """What is in a file that gzip finds no fault with."""
     try:
         return gzip.decompress(content)
     except (OSError, EOFError, zlib.error):
@@ -471,10 +459,8 @@ def test_damaged_archives(shards):
     ({"y": ROLLOUTS["aaaa"].y.astype(float) * 1e40}, {}, "segment aaaa, field y: .*not finite"),
     ({"object_id": np.array([100, 101, 100])}, {}, "segment aaaa, field object_id: agent 100 more than once"),
     ({"object_id": np.array([100, 101, 2**31])}, {}, "field object_id: agent 2147483648 has no number of 32 bits"),
-    ({}, {"times": 2}, "more than once"),
-    ({}, {"shards": 2}, "don't fill 2 shards"),
-    ({}, {"shards": 0}, "at least 1"),
-    ({}, {"name": "made.tar"}, "ends in"),
+    ({}, {"times": 2}, "more than once"), ({}, {"shards": 2}, "don't fill 2 shards"),
+    ({}, {"shards": 0}, "at least 1"), ({}, {"name": "made.tar"}, "ends in"),
     ({}, {"meta": replace(META, acknowledge_complies_with_closed_loop_requirement=False)}, "not acknowledged"),
 ])  # fmt: skip
 def test_what_cannot_be_submitted_is_not_written(tmp_path, changes, how, text):

@@ -10,17 +10,12 @@ import torch
 
 from symphony.wosac.files import read_rollouts
 from symphony.wosac.records import logged_scenario, parse_scenario, read_scenarios
-from symphony.wosac.scorer import CHALLENGES, Component, compute_features, score_features
+from symphony.wosac.scorer import CHALLENGES, Component, compute_features, score_features, scoring
 from symphony.wosac.scorer.boxes import Boxes, distance_to_nearest, time_to_collision
 from symphony.wosac.scorer.features import speed
 from symphony.wosac.scorer.lights import Lanes, Signals, red_light_violations
 from symphony.wosac.scorer.road import Edges, distance_to_road_edge, signed_distance_to_edges
-from symphony.wosac.scorer.scoring import (
-    bin_edges,
-    flag_log_likelihood,
-    histogram_log_likelihood,
-    log_likelihoods,
-)
+from symphony.wosac.scorer.scoring import flag_log_likelihood, histogram_log_likelihood, log_likelihoods
 
 pytestmark = pytest.mark.samples
 
@@ -119,7 +114,7 @@ def test_configurations_and_their_bins(manifest):
             assert (mine.bins or ()) == pytest.approx(expected[part].bins or (), rel=1e-6)
     parts = [part for entry in manifest["configs"].values() for part in entry.values() if bins_of(part)]
     for part in parts:
-        equal(bin_edges(bins_of(part)), np.array(part["histogram"]["edges_float32"], np.float32))
+        equal(scoring.bin_edges(bins_of(part)), np.array(part["histogram"]["edges_float32"], np.float32))
 
 
 def scored_first(arrays, names):

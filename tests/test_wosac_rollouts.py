@@ -27,31 +27,13 @@ from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation.table import WOSAC, Entry, compare
 from symphony.rollouts.driving import simulation
-from symphony.wosac.evaluate import (
-    evaluate_wosac,
-    log_playback,
-    order_of,
-    passing_gaps,
-    passing_pairs,
-    simulated_how,
-    wosac_scenario,
-    wosac_window,
-)
+from symphony.wosac import constant_velocity, evaluate_wosac, log_playback, wosac_rollouts, wosac_window
+from symphony.wosac.evaluate import order_of, passing_gaps, passing_pairs, simulated_how, wosac_scenario
 from symphony.wosac.records import logged_scenario, parse_scenario, read_scenarios
 from symphony.wosac.scorer import SimulatedRollouts, compute_features, score
 from symphony.wosac.scorer.scenario import STATES
-from symphony.wosac.simulate import (
-    AHEAD,
-    COURSE,
-    PACE,
-    between_decisions,
-    constant_velocity,
-    future_log,
-    history_only,
-    standing,
-    walks,
-    wosac_rollouts,
-)
+from symphony.wosac.simulate import AHEAD, COURSE, PACE, future_log, history_only, standing, walks
+from symphony.wosac.simulate import between_decisions as between
 from symphony.wosac.submission import check_submission, required_agents
 from symphony.wosac.table import COLUMNS, wosac_table
 from test_selection import CASES, scene
@@ -66,7 +48,6 @@ TOLD = """
 --uses-camera-data False --uses-public-model-pretraining False
 --acknowledge-complies-with-closed-loop-requirement True
 """
-META = TOLD.split()
 
 
 def mixed_record(name="0123456789abcdef"):
@@ -86,7 +67,7 @@ def same(a, b):
 
 
 def submitted(data, out, *more):
-    return main(["wosac", "submit", *more, "--data", str(data), "--out", str(out), *META])
+    return main(["wosac", "submit", *more, "--data", str(data), "--out", str(out), *TOLD.split()])
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 0.2, 0.25, 0.4]))
@@ -96,7 +77,7 @@ def test_states_between_decisions_are_those_of_resampling(seed, dt):
     heading = rng.uniform(-10, 10, segment.heading.shape).astype(np.float32)
     segment = segment.replace(position=position, heading=heading)
     states = np.concatenate([position[..., :2], heading[..., None]], -1).astype(np.float64)
-    found = between_decisions(states.swapaxes(0, 1)[None], dt)[0]
+    found = between(states.swapaxes(0, 1)[None], dt)[0]
     expected = segment if dt == 0.1 else resample(segment, 0.1)
     np.testing.assert_allclose(found[..., :2], expected.position[:, 1:, :2], atol=1e-4)
     np.testing.assert_allclose(wrap(found[..., 2] - expected.heading[:, 1:]), 0, atol=1e-4)
@@ -230,20 +211,16 @@ def test_a_real_scenario(samples):
 
 def test_what_is_scored():
     segment = straight_road(num_agents=4)
-
-    def scored(one):
-        return wosac_scenario(wosac_window(one)).evaluated.tolist()
-
-    assert scored(segment) == sorted(segment.agent_id)
-    # An agent that comes later is not.
-    assert scored(hide(segment, 3, slice(0, 6))) == sorted(segment.agent_id[:3])
     marked = segment.replace(predict=np.array([2], np.int32))
-    assert scored(marked) == sorted(segment.agent_id[[segment.ego, 2]])
+    # An agent that comes later is not.
+    late = hide(segment, 3, slice(0, 6))
+    for one, rows in ((segment, [0, 1, 2, 3]), (late, [0, 1, 2]), (marked, [segment.ego, 2])):
+        assert wosac_scenario(wosac_window(one)).evaluated.tolist() == sorted(segment.agent_id[rows])
 
 
 def test_a_world_with_a_far_origin_is_scored_as_one_about_its_own():
     """Scores are in float32, which at 4 000 km, as in UTM coordinates, has steps of a quarter of a metre."""
-    segment, found = crossing(num_agents=3), []
+    segment, found = crossing(3), []
     for origin in ((0.0, 0.0, 0.0), (664_430.0, 3_998_210.0, 600.0)):
         window = validate(wosac_window(segment.replace(origin=np.array(origin))))
         found.append(score(wosac_scenario(window), constant_velocity(window)))
@@ -380,8 +357,7 @@ def test_who_goes_first_in_the_log_and_when_held_up(case):
     for values in states.values():
         values[:, late, 50:], values[:, late, :50] = values[:, late, :30].copy(), values[:, late, :1].copy()
     held = order_of([passing_gaps(window, pairs, replace(log, **states))])
-    assert held.kept == 0
-    assert held.reversed + held.apart == pytest.approx(1)
+    assert (held.kept, held.reversed + held.apart) == (0, pytest.approx(1))
     window = wosac_window(straight_road())
     assert order_of([passing_gaps(window, passing_pairs(window), constant_velocity(window))]).pairs == 0
 

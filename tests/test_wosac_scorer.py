@@ -15,15 +15,8 @@ from hypothesis import strategies as st
 
 from helpers_wosac import ROAD, made_rollouts, made_scenario
 from symphony.errors import DataError
-from symphony.wosac.scorer import (
-    CHALLENGES,
-    SimulatedRollouts,
-    compute_features,
-    object_scores,
-    road,
-    score,
-    score_features,
-)
+from symphony.wosac import CHALLENGES, SimulatedRollouts
+from symphony.wosac.scorer import compute_features, object_scores, road, score, score_features
 from symphony.wosac.scorer.boxes import Boxes, time_to_collision
 from symphony.wosac.scorer.config import BUCKETS
 from symphony.wosac.scorer.lights import Lanes, Signals, red_light_violations
@@ -95,9 +88,7 @@ def test_road_edges_by_hand():
 
 
 @pytest.mark.parametrize(("runs", "change"), [
-    (True, {}),
-    *((state in (1, 4), {"state": state}) for state in range(9)),
-    (False, {"lane": 8}),
+    (True, {}), *((state in (1, 4), {"state": state}) for state in range(9)), (False, {"lane": 8}),
     (False, {"lane": 9}),  # A lane that is not there.
     (False, {"aside": 40.0}),  # The car is on the other lane.
     (False, {"seen": 2}),  # Not observed before, its stop point was at the origin then, which the car had passed.
@@ -178,8 +169,7 @@ def test_scenarios_that_cannot_be_scored(changes, field, text):
     (lambda r: replace(r, object_id=np.array([10, 11, 12, 12])), "object_id", "agent 12 more than once"),
     (lambda r: replace(r, object_id=r.object_id[None]), "object_id", "has shape"),
     (lambda r: replace(r, y=r.y[..., :79]), "y", "has shape"),
-    (lambda r: replace(r, x=r.x[0, 0, 0]), "x", "no rollouts"),
-    (lambda r: replace(r, x=r.x[:0]), "x", "no rollouts"),
+    (lambda r: replace(r, x=r.x[0, 0, 0]), "x", "no rollouts"), (lambda r: replace(r, x=r.x[:0]), "x", "no rollouts"),
     (lambda r: replace(r, x=np.where(np.arange(80) == 5, np.nan, r.x)), "x", "agent 10, rollout 0, step 16: not fin"),
     (lambda r: replace(r, heading=r.heading.astype(float) + 1e39), "heading", "agent 10, .*: not finite"),
 ])  # fmt: skip
