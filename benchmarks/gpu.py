@@ -54,9 +54,7 @@ def seconds(work: Callable[[], Any], device: torch.device, rounds: int) -> tuple
 
 def main() -> None:
     """Print a line for each."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--branches", type=int, default=10_000, help="the most, over all scenes")
     parser.add_argument("--scenes", type=int, default=16)

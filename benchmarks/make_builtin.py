@@ -126,9 +126,7 @@ def main() -> None:
         print(f"{name}:")
         if not only_describe:
             accepted, reasons, seconds = make(name, split)
-            print(
-                f"  accepted {accepted} segments in {seconds:.0f} s: {accepted / seconds * 60:.0f} per minute"
-            )
+            print(f"  accepted {accepted} segments in {seconds:.0f} s: {accepted / seconds * 60:.0f} per minute")
             print(f"  windows left out: {dict(reasons.most_common())}")
         store = SegmentStore(builtin_store(name))
         total += sum(file.stat().st_size for file in Path(store.path).rglob("*") if file.is_file())

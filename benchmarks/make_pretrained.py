@@ -99,9 +99,7 @@ def make(
     config, spec, checkpoint = read_run(source), read_spec(source), choose(source, which)
     step = int(checkpoint.name[-12:])
     records = _read_scores(source, scores)
-    known = Source(
-        config, spec, step, _before(source, config), _checksum(config.data), records, holds, limits
-    )
+    known = Source(config, spec, step, _before(source, config), _checksum(config.data), records, holds, limits)
     out = replace(config, search=pruning.pruning(config.search))
     for record in records:
         _check_scores(record, out, step)
@@ -121,9 +119,7 @@ def make(
     save_checkpoint(place / "checkpoints", step=step, modules=modules)
     for given in records:
         _keep(place, name, given, step)
-    parameters = {
-        part: sum(weights.numel() for weights in module.parameters()) for part, module in modules.items()
-    }
+    parameters = {part: sum(weights.numel() for weights in module.parameters()) for part, module in modules.items()}
     facts = card_of(name, known, out, parameters)
     write_json(place / CARD, facts)
     (place / "README.md").write_text(page(facts), encoding="utf-8")
@@ -338,15 +334,13 @@ def _training(source: Source, config: TrainConfig) -> str:
         text += f" The run went on to {_count(own.steps)} updates."
     if own.validation.data is not None:
         text += (
-            f" The checkpoint was chosen by {own.validation.segments} segments of "
-            f"`{data_name(own.validation.data)}`."
+            f" The checkpoint was chosen by {own.validation.segments} segments of `{data_name(own.validation.data)}`."
         )
     if source.spec.searches:
         text += f" Searches in training had {own.search.branches} branches, pruned {_pruning(asdict(own.search))}."
         if config.search != own.search:
             text += (
-                f" From now on its trees are pruned {_pruning(asdict(config.search))}, which it was not trained "
-                "with."
+                f" From now on its trees are pruned {_pruning(asdict(config.search))}, which it was not trained with."
             )
     return text
 
@@ -359,9 +353,7 @@ def _pruning(search: dict[str, Any]) -> str:
 
 
 def _settings(config: TrainConfig, spec: AgentSpec, parameters: dict[str, int]) -> dict[str, str]:
-    rows: list[tuple[str, Any]] = [
-        (f"weights of the {part}", _count(number)) for part, number in parameters.items()
-    ]
+    rows: list[tuple[str, Any]] = [(f"weights of the {part}", _count(number)) for part, number in parameters.items()]
     rows += [(f"`agent.{key}`", value) for key, value in asdict(config.agent).items()]
     rows += [("`learning_rate`", config.learning_rate)]
     if spec.discriminator is not None:
@@ -464,9 +456,7 @@ def _count(number: int) -> str:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Write one agent and say how large it is."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", help="folder of a run, or RUN@WHICH")
     parser.add_argument("name", help="of the agent, such as bc_ts_h")
     parser.add_argument(

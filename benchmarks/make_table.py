@@ -24,9 +24,7 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/table"), help="folder of the runs and the table"
-    )
+    parser.add_argument("--out", type=Path, default=Path("out/table"), help="folder of the runs and the table")
     arguments, further = parser.parse_known_args(args)
     out: Path = arguments.out
     for method in METHODS:

@@ -114,12 +114,10 @@ CURVES: dict[str, dict[int, Row]] = {
     "agents A": {n: Row(work=partial(rings, 16, 200, count=16, agents=n)) for n in (2, 8, 32, 128)},
     "points P": {n: Row(work=partial(rings, 16, n, count=16)) for n in (16, 64, 256, 1000)},
     "branches S": {
-        n: Row(work=partial(search, branches=n, segments=4, steps=10), warm=1, rounds=3)
-        for n in (1, 4, 16, 64)
+        n: Row(work=partial(search, branches=n, segments=4, steps=10), warm=1, rounds=3) for n in (1, 4, 16, 64)
     },
     "steps T": {
-        n: Row(work=partial(search, branches=4, segments=4, steps=n), warm=1, rounds=3)
-        for n in (10, 20, 50, 100)
+        n: Row(work=partial(search, branches=4, segments=4, steps=n), warm=1, rounds=3) for n in (10, 20, 50, 100)
     },
 }
 """Steps of ring roads with 32 agents in 16 scenes, 16 objects and 200 points, and searches on 4 segments with 4
@@ -289,9 +287,7 @@ def forked(function: Callable[[], Any]) -> Any:
 def machine() -> dict[str, Any]:
     """What it was measured with."""
     info = Path("/proc/cpuinfo")
-    models = [
-        line.partition(":")[2].strip() for line in info.read_text().splitlines() if "model name" in line
-    ]
+    models = [line.partition(":")[2].strip() for line in info.read_text().splitlines() if "model name" in line]
     versions = {"symphony": __version__, "torch": torch.__version__, "python": platform.python_version()}
     return {"processor": models[0] if models else platform.machine(), "cores": os.cpu_count(), **versions}
 
@@ -299,9 +295,7 @@ def machine() -> dict[str, Any]:
 @torch.no_grad()
 def main() -> None:
     """Measure, showing each row as it is done."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", nargs="+", default=["*"], metavar="PATTERN", help="names of rows")
     parser.add_argument("--rounds", type=int, default=15, help="at most; long rows have fewer")

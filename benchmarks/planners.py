@@ -71,9 +71,7 @@ class Pole(Plane):
         push = (10 * action.squeeze(-1) + 0.05 * turning**2 * angle.sin()) / 1.1
         bend = (9.8 * angle.sin() - angle.cos() * push) / (0.5 * (4 / 3 - 0.1 * angle.cos() ** 2 / 1.1))
         gain = push - 0.05 * bend * angle.cos() / 1.1
-        after = torch.stack(
-            [x + 0.02 * v, v + 0.02 * gain, angle + 0.02 * turning, turning + 0.02 * bend], -1
-        )
+        after = torch.stack([x + 0.02 * v, v + 0.02 * gain, angle + 0.02 * turning, turning + 0.02 * bend], -1)
         lean = after[..., 2].abs() / 0.2095
         return after, 1 - lean, (after[..., 0].abs() > 2.4) | (lean > 1)
 
@@ -88,9 +86,7 @@ def planner(kind: str, env: EnvBase) -> Any:
         return MPPIPlanner(env, value, 1.0, HORIZON, ROUNDS, CANDIDATES, 8)
     if kind == "random":
         return None
-    return BeamSearchPlanner(
-        env, HORIZON, ROUNDS * CANDIDATES, prune_every=int(kind.removeprefix("beam every "))
-    )
+    return BeamSearchPlanner(env, HORIZON, ROUNDS * CANDIDATES, prune_every=int(kind.removeprefix("beam every ")))
 
 
 @torch.no_grad()
@@ -107,9 +103,7 @@ def main() -> None:
             for seed in range(SEEDS):
                 torch.manual_seed(seed)
                 env = make(seed)
-                found = with_rows(env, [ROWS]).rollout(
-                    STEPS[name], planner(kind, env), break_when_any_done=False
-                )
+                found = with_rows(env, [ROWS]).rollout(STEPS[name], planner(kind, env), break_when_any_done=False)
                 done = found["next", "done"].long()
                 going = done.cumsum(-2) - done == 0
                 returns.append((found["next", "reward"] * going).sum(-2).mean())

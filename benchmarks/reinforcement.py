@@ -140,9 +140,7 @@ def sac(env: DrivingEnv) -> tuple[nn.Module, Callable[[TensorDictBase], None]]:
     seen = scene_module(network, OTHERS, ("agents", "head"), own_keys=OWN)
     where = [("agents", name) for name in ("loc", "scale")]
     normal = TensorDictModule(NormalParamExtractor(), [("agents", "head")], where)
-    actor = ProbabilisticActor(
-        TensorDictSequential(seen, normal), where, [PEDALS], distribution_class=TanhNormal
-    )
+    actor = ProbabilisticActor(TensorDictSequential(seen, normal), where, [PEDALS], distribution_class=TanhNormal)
     loss = SACLoss(actor, critic("action_value", PEDALS), alpha_init=0.02, target_entropy=-2.0)
     loss.set_keys(action=PEDALS, state_action_value=("agents", "action_value"), reward=keys.REWARD, **ENDS)
     loss.make_value_estimator(gamma=0.97)
@@ -235,9 +233,7 @@ def curves(runs: dict[str, list[dict[str, Any]]], path: Path) -> None:
 
 def main() -> None:
     """Do the runs that are not there yet, write the record, and draw the curves."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs=2, metavar=("METHOD", "SEED"), help="one run, without the record")
     only = parser.parse_args().only
     RUNS.mkdir(parents=True, exist_ok=True)

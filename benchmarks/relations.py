@@ -157,12 +157,8 @@ def segment_rows(
         tables.append((entry, {str(row["segment"]): row for row in rows}))
     names = sorted(set.intersection(*(set(rows) for _, rows in tables)))
     if not names:
-        raise ConfigError(
-            f"{' and '.join(method_name(side[0].method) for side in sides)} share no run segment"
-        )
-    numbers = [
-        [[entry.number(key, rows[name]) for name in names] for key in metrics] for entry, rows in tables
-    ]
+        raise ConfigError(f"{' and '.join(method_name(side[0].method) for side in sides)} share no run segment")
+    numbers = [[[entry.number(key, rows[name]) for name in names] for key in metrics] for entry, rows in tables]
     groups = [str(tables[0][1][name].get("group") or name) for name in names]
     split = np.split(np.array(numbers), [len(sides[0])])
     return np.unique(groups, return_inverse=True)[1], [part.mean(0) for part in split]
@@ -181,10 +177,7 @@ def paired_lines(entries: Sequence[Entry], base: str) -> list[str]:
     for method in (method for method in methods if method != base):
         member, (mine, other) = segment_rows([methods[method], methods[base]], keys)
         means = [clustered_mean(away, member) for away in mine - other]
-        texts = [
-            f"{mean:+.2f} ± {error:.2f} {COLUMNS[k].unit}"
-            for k, (mean, error) in zip(keys, means, strict=True)
-        ]
+        texts = [f"{mean:+.2f} ± {error:.2f} {COLUMNS[k].unit}" for k, (mean, error) in zip(keys, means, strict=True)]
         away = ", ".join(f"{COLUMNS[key].title} {text}" for key, text in zip(keys, texts, strict=True))
         count = f"{len(member)} segments of {member.max() + 1} groups"
         lines.append(f"{method_name(method)} less {method_name(base)}: {away} ({count})")
@@ -211,9 +204,7 @@ def relations_text(found: Sequence[Relation]) -> str:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Print the relations."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, nargs="+")
     parser.add_argument("--setting", choices=SETTINGS, default="main")
     parser.add_argument("--evaluation", nargs="+", default=())

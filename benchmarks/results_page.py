@@ -57,9 +57,7 @@ def rewritten(text: str) -> str:
 
 def main(args: list[str] | None = None) -> int:
     """Rewrite the pages, or compare them with the records."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true")
     check = parser.parse_args(args).check
     differing = []

@@ -54,9 +54,7 @@ def simulated(agent: Agent, segment: RunSegment, seed: int, *, back: bool) -> tu
     seen: list[tuple[Tensor, Tensor, Tensor]] = []
 
     def score(state: TensorDictBase) -> Tensor:
-        seen.append(
-            tuple(state.get(key).flatten(0, state.ndim - 1) for key in (keys.STREAM, keys.STEP, keys.STATE))
-        )
+        seen.append(tuple(state.get(key).flatten(0, state.ndim - 1) for key in (keys.STREAM, keys.STEP, keys.STATE)))
         return rule_score(env, state)
 
     rule: Backtrack | ReplaceBad = ReplaceBad(0.0)
@@ -90,9 +88,7 @@ def simulated(agent: Agent, segment: RunSegment, seed: int, *, back: bool) -> tu
     )
     ends = found.trajectories
     if back:
-        kept = set(
-            zip(ends.get(keys.STREAM).flatten().tolist(), ends.get(keys.STEP).flatten().tolist(), strict=True)
-        )
+        kept = set(zip(ends.get(keys.STREAM).flatten().tolist(), ends.get(keys.STEP).flatten().tolist(), strict=True))
     else:
         kept = {
             (first[slot], period * EVERY + step)
@@ -102,9 +98,7 @@ def simulated(agent: Agent, segment: RunSegment, seed: int, *, back: bool) -> tu
         }
     steps: Steps = []
     for streams, numbers, states in seen:
-        for stream, number, place in zip(
-            streams.flatten().tolist(), numbers.flatten().tolist(), states, strict=True
-        ):
+        for stream, number, place in zip(streams.flatten().tolist(), numbers.flatten().tolist(), states, strict=True):
             line, attempt = of[stream]
             steps.append((line, attempt, number, (stream, number - 1) in kept, place[:, :2].numpy()))
     if back:
@@ -117,20 +111,12 @@ def draw_over_time(axes: Axes, steps: Steps, copies: Copies, dt: float, title: s
     """One row for each line; what it tried before it went back lies below it."""
     high = max(attempt for _, attempt, *_ in steps) + 1
     for color, width, wanted in ((LOST, 1.0, False), (KEPT, 2.2, True)):
-        rows = [
-            (line + 0.7 * attempt / high, number)
-            for line, attempt, number, good, _ in steps
-            if good is wanted
-        ]
+        rows = [(line + 0.7 * attempt / high, number) for line, attempt, number, good, _ in steps if good is wanted]
         bars = [[((number - 1) * dt, row), (number * dt, row)] for row, number in rows]
         axes.add_collection(LineCollection(bars, colors=color, linewidths=width, capstyle="butt"))
     for number, old, new in copies:
-        axes.annotate(
-            "", (number * dt, new), (number * dt, old), arrowprops={"arrowstyle": "->", "color": "#6F6A62"}
-        )
-    axes.set(
-        xlim=(0, max(number for _, _, number, *_ in steps) * dt), ylim=(BRANCHES, -0.5), xlabel="s", yticks=[]
-    )
+        axes.annotate("", (number * dt, new), (number * dt, old), arrowprops={"arrowstyle": "->", "color": "#6F6A62"})
+    axes.set(xlim=(0, max(number for _, _, number, *_ in steps) * dt), ylim=(BRANCHES, -0.5), xlabel="s", yticks=[])
     axes.set_title(title, loc="left", fontsize=10)
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
@@ -150,9 +136,7 @@ def draw_on_map(axes: Axes, steps: Steps, segment: RunSegment) -> None:
 
 def main() -> None:
     """Draw."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="picture to write")
     parser.add_argument("--agent", default="pretrained:bc_ts_h", help="agent that drives")
     parser.add_argument("--data", type=Path, default=builtin_store("test"), help="store of run segments")
@@ -167,9 +151,7 @@ def main() -> None:
         draw_on_map(axes[0], steps, segment)
         lost = sum(not good for *_, good, _ in steps) / len(steps)
         name = "16 lines that go back" if back else "16 branches of a tree"
-        draw_over_time(
-            axes[1], steps, copies, segment.dt, f"{name}: {100 * lost:.0f} % of the steps given up"
-        )
+        draw_over_time(axes[1], steps, copies, segment.dt, f"{name}: {100 * lost:.0f} % of the steps given up")
     save(figure, given.out)
 
 

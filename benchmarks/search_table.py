@@ -89,9 +89,7 @@ def record(data: Path, out: Path, store: str, way: str) -> dict[str, Any]:
 
 def main() -> None:
     """Make what is not there, then the table, a row for each way and store."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
@@ -101,10 +99,7 @@ def main() -> None:
     for store in STORES:
         found = {way: record(given.data, given.out, store, way) for way in WAYS}
         for way, one in found.items():
-            cells = [
-                f"{one[name]:.{digits}f} ± {one[f'{name}_se']:.{digits}f}"
-                for name, digits in FIGURES.values()
-            ]
+            cells = [f"{one[name]:.{digits}f} ± {one[f'{name}_se']:.{digits}f}" for name, digits in FIGURES.values()]
             costs = [one["steps"] / found["no search"]["steps"], one["seconds"] / one["segments"]]
             cells += [*(f"{cost:.2f}" for cost in costs), f"{one['along']:.1f}", f"{one['any']:.0f}"]
             lines.append([f"{store}: {way}", *cells])

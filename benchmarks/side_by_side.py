@@ -68,9 +68,7 @@ class Worker:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--before", required=True, help="a commit")
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--only", nargs="+")
@@ -131,8 +129,7 @@ def row(name: str, found: dict[str, list[dict[str, float]]]) -> str:
 
     speed = {way: found[way][0]["steps"] / middle(way, "seconds") for way in found}
     faults, peak = (
-        " → ".join(f"{middle(way, what):,.0f}" for way in WAYS if way in found)
-        for what in ("faults", "mebibytes")
+        " → ".join(f"{middle(way, what):,.0f}" for way in WAYS if way in found) for what in ("faults", "mebibytes")
     )
     if name in YARDSTICKS:
         return f"| {name} | | {speed['after']:,.0f} | | | | | {faults} | {peak} |"

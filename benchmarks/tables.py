@@ -141,9 +141,7 @@ CPU time, medians. `make bench` measures again, in {minutes}. A product of matri
 
 def main() -> None:
     """Print or write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("report", type=Path)
     parser.add_argument("--before", type=Path)
     parser.add_argument("--write", action="store_true", help="as the latest report")

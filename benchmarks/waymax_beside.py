@@ -135,18 +135,14 @@ def agree(scenes: SceneBatch, after: Any, flags: Any) -> None:
     place = np.stack([np.asarray(getattr(after.sim_trajectory, axis))[..., 1] for axis in "xy"], -1)
     apart = np.abs(ours[keys.STATE][..., :2].numpy() - place).max()
     hit, theirs = ours[keys.COLLISION].squeeze(-1).numpy(), np.asarray(flags["overlap"].value) > 0
-    print(
-        f"one step: positions within {apart:.0e} m, {(hit == theirs).mean():.0%} of {hit.size} overlap flags equal"
-    )
+    print(f"one step: positions within {apart:.0e} m, {(hit == theirs).mean():.0%} of {hit.size} overlap flags equal")
     if apart > 1e-4 or (hit != theirs).any():
         raise SystemExit("they don't do the same")
 
 
 def main() -> None:
     """Whether both do the same, agent-steps a second of both, and their ratio."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     options = parser.parse_args()
@@ -174,9 +170,7 @@ def main() -> None:
             work()
             seconds.append(clock() - began)
         found[name] = SCENES * AGENTS / float(np.median(seconds))
-        print(
-            f"{name}: {found[name]:,.0f} agent-steps/s {'on the card' if card else 'of CPU time'}", flush=True
-        )
+        print(f"{name}: {found[name]:,.0f} agent-steps/s {'on the card' if card else 'of CPU time'}", flush=True)
     print(f"ratio: {found['symphony'] / found['waymax']:.1f}")
 
 

@@ -55,9 +55,7 @@ def ring(seed: int, agents: int = AGENTS, points: int = POINTS, steps: int = 11)
     half, k = points // 2, np.arange(points // 2)
     angle = 2 * np.pi * k / half
     # Outer edge counter-clockwise, inner edge clockwise: the drivable side is on the left of both.
-    lines = [
-        radius * np.stack([np.cos(s * angle), np.sin(s * angle)], -1) for radius, s in ((100, 1), (70, -1))
-    ]
+    lines = [radius * np.stack([np.cos(s * angle), np.sin(s * angle)], -1) for radius, s in ((100, 1), (70, -1))]
     start = np.concatenate(lines)
     end = np.concatenate([np.roll(line, -1, 0) for line in lines])
     turn, radius = rng.uniform(0, 2 * np.pi, agents), rng.uniform(72, 98, agents)
@@ -93,9 +91,7 @@ def ring(seed: int, agents: int = AGENTS, points: int = POINTS, steps: int = 11)
         "route_count": np.zeros((agents, 0)),
         "route_logged": np.full(agents, -1),
     }
-    made = {
-        name: torch.as_tensor(value)[None].to(getattr(base, name).dtype) for name, value in fields.items()
-    }
+    made = {name: torch.as_tensor(value)[None].to(getattr(base, name).dtype) for name, value in fields.items()}
     rest = {name: getattr(base, name) for name in SceneBatch.__annotations__ if name not in made}
     return SceneBatch(**made, **rest, batch_size=[1])
 
@@ -112,9 +108,7 @@ def step_of(scenes: SceneBatch, config: ObservationConfig, rows: Tensor, *, comp
     return lambda: env.step(start.copy()), rows.numel() * env.num_agents
 
 
-def rings(
-    objects: int, points: int, *, count: int = SCENES, agents: int = AGENTS, device: str = "cpu"
-) -> Work:
+def rings(objects: int, points: int, *, count: int = SCENES, agents: int = AGENTS, device: str = "cpu") -> Work:
     """All agents of some ring roads."""
     scenes = collate([ring(seed, agents) for seed in range(count)]).to(torch.device(device))
     if objects or points:
@@ -329,9 +323,7 @@ class Measured:
 @torch.no_grad()
 def main() -> None:
     """Measure one workload once for each line that comes in."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workload", choices=WORKLOADS)
     parser.add_argument("--warm", type=int, default=40)
     parser.add_argument("--keep-memory", action="store_true", help="as the symphony command does")

@@ -65,9 +65,7 @@ def compared(scenario: WosacScenario, file: Path, expected: dict[str, Any]) -> d
 
 def main() -> None:
     """Compare all cases and write them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", type=Path, required=True)
     parser.add_argument("--official", type=Path, required=True)
     parser.add_argument("--json", type=Path, required=True)

@@ -17,9 +17,7 @@ import symphony
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = sorted({file.parent.name for file in ROOT.glob("src/symphony/*/__init__.py")} - {"cli"})
-RECIPES = [
-    file.stem for file in sorted((ROOT / "recipes").glob("*.py")) if f"def {file.stem}(" in file.read_text()
-]
+RECIPES = [file.stem for file in sorted((ROOT / "recipes").glob("*.py")) if f"def {file.stem}(" in file.read_text()]
 FURTHER = {
     "data": (
         *("segment.RunSegment", "store.SegmentStore", "builtin.builtin_store", "convert.convert"),
@@ -62,9 +60,7 @@ STAR = re.compile(r"(`+[^`]+`+)|\[\*")
 
 def homes(file: Path) -> dict[str, str]:
     """Modules that a package imports its names from."""
-    imports = [
-        n for n in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(n, ast.ImportFrom)
-    ]
+    imports = [n for n in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(n, ast.ImportFrom)]
     return {name.name: str(node.module) for node in imports for name in node.names if name.asname}
 
 
@@ -75,9 +71,7 @@ def page(room: str) -> str:
     parts = [f"# symphony.{room}\n", f"::: symphony.{room}\n{options}"]
     file = ROOT / f"src/symphony/{room}/__init__.py"
     if "__all__ = __dir__()" in file.read_text(encoding="utf-8"):  # names that are not written out
-        parts += [
-            f"::: {home}.{name}\n" for name, home in homes(file).items() if home.startswith("symphony.")
-        ]
+        parts += [f"::: {home}.{name}\n" for name, home in homes(file).items() if home.startswith("symphony.")]
     parts += [f"::: symphony.{room}.{name}\n{source}" for name in FURTHER.get(room, ())]
     return "\n".join(parts)
 

@@ -52,9 +52,7 @@ def drive(policy) -> TensorDictBase:
 def main(iterations: int = 60, rows: int = 16, branches: int = 16, updates: int = 16) -> list[float]:
     """Print and return costs per step without search: the expert's, the policy's before and while it learns."""
     torch.manual_seed(0)
-    heads = TensorDictModule(
-        Net(MLP(3, 2, num_cells=[64, 64]), NormalParamExtractor()), STATE, ["loc", "scale"]
-    )
+    heads = TensorDictModule(Net(MLP(3, 2, num_cells=[64, 64]), NormalParamExtractor()), STATE, ["loc", "scale"])
     actor = ProbabilisticActor(heads, ["loc", "scale"], distribution_class=torques)
     discriminator = TensorDictModule(Net(MLP(3, 1, num_cells=[64, 64]), nn.Flatten(-2)), STATE, ["score"])
     collector = BeamSearchCollector(

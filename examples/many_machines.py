@@ -34,9 +34,7 @@ AGENT = "pretrained:bc_ts_h"
 def make_env(share: int, shares: int, rows: int) -> EnvBase:
     """As many scenes at a time as there are rows, drawn from every so many-th segment of the store."""
     agent, store = load_agent(AGENT), SegmentStore(builtin_store("train"))
-    data = SceneDataset(
-        store, agent.interactive, agent.dynamics, range(share, len(store), shares), routes=True
-    )
+    data = SceneDataset(store, agent.interactive, agent.dynamics, range(share, len(store), shares), routes=True)
     rng = torch.Generator().manual_seed(share)
     return with_rows(DrivingEnv(data, agent.dynamics, agent.observation, generator=rng), [rows])
 
@@ -79,9 +77,7 @@ def collected(workers: int, batches: int, rows: int, branches: int, steps: int) 
         collector.shutdown()
 
 
-def main(
-    most: int = 2, batches: int = 4, rows: int = 8, branches: int = 16, steps: int = 50
-) -> dict[int, float]:
+def main(most: int = 2, batches: int = 4, rows: int = 8, branches: int = 16, steps: int = 50) -> dict[int, float]:
     """Print and return searches a second by number of workers."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # of every worker
     found = {}

@@ -85,9 +85,7 @@ def main(segments: int = 8, rollouts: int = 4, out: str = "") -> dict[str, float
     dataset = SceneDataset(store, 2, agent.dynamics, range(segments), routes=True, duration=10)
     sys.path.append(str(Path(__file__).parent))
     path = out or mkdtemp()
-    folder = save_simulation(
-        path, agent, dataset, EvaluateConfig(rollouts=rollouts), planner="planner:Careful"
-    )
+    folder = save_simulation(path, agent, dataset, EvaluateConfig(rollouts=rollouts), planner="planner:Careful")
     totals = report(folder, "ego").totals()
     for name in ("runs", "failed_runs", "collision_rate", "red_light_rate", "progress_ratio"):
         print(f"{name:24} {totals[name]:.2f}")

@@ -46,9 +46,7 @@ def torques(loc: Tensor, scale: Tensor) -> Independent:
 @torch.no_grad()
 def cost(actor: ProbabilisticActor) -> float:
     """Mean cost per step of the policy alone."""
-    rewards = [
-        make_env().rollout(STEPS, actor, break_when_any_done=False)["next", "reward"] for _ in range(4)
-    ]
+    rewards = [make_env().rollout(STEPS, actor, break_when_any_done=False)["next", "reward"] for _ in range(4)]
     return -float(torch.stack(rewards).mean())
 
 

@@ -64,9 +64,7 @@ def batch_of(env: DrivingEnv, state: TensorDict) -> TensorDict:
     batch = env.choices(env.with_goals(state))
     valid = batch.get(keys.VALID)
     action = torch.zeros_like(valid, dtype=torch.int64)
-    batch.set(
-        keys.ACTION, action if env.dynamics.discrete else action[..., None].expand(*valid.shape, 2) + 0.5
-    )
+    batch.set(keys.ACTION, action if env.dynamics.discrete else action[..., None].expand(*valid.shape, 2) + 0.5)
     batch.set(keys.ROLLOUT, torch.zeros_like(valid))
     batch.set(keys.SIMULATED, torch.zeros_like(valid))
     batch.set(keys.GOAL_SET, batch.get(keys.ROUTES_MASK))

@@ -18,9 +18,7 @@ from symphony.data.sources import womd_pb2 as pb
 from symphony.errors import DataError
 from symphony.geometry import segments_of, signed_distance
 
-IN_FOLDER = settings(
-    deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+IN_FOLDER = settings(deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 """Of laws whose examples are written into one folder."""
 FAR = np.array([-7792.0, 81234.0, -184.0])
 """Where the made WOMD scenarios lie: far enough that float32 would lose millimetres."""
@@ -97,9 +95,7 @@ def exact(tag: str, value: object) -> str:
     return f"<{tag}><exact>{value}</exact></{tag}>"
 
 
-def state(
-    step: int, x: float, y: float, heading: float = 0.0, speed: float | None = 10.0, tag="state"
-) -> str:
+def state(step: int, x: float, y: float, heading: float = 0.0, speed: float | None = 10.0, tag="state") -> str:
     inner = f"<position><point><x>{x}</x><y>{y}</y></point></position>"
     inner += exact("orientation", heading) + exact("time", step)
     return f"<{tag}>{inner}{exact('velocity', speed) if speed is not None else ''}</{tag}>"
@@ -125,9 +121,9 @@ def driver(obstacle_id: int, version="2020a", x=0.0, y=0.0, speed=10.0, steps=ra
     return obstacle(obstacle_id, [state(k, x + speed * 0.1 * k, y, 0.0, speed) for k in steps], version)
 
 
-ROAD = lanelet(
-    10, [(0, 2), (25, 2), (50, 2)], [(0, -2), (25, -2), (50, -2)], '<successor ref="11"/>'
-) + lanelet(11, [(50, 2), (100, 2)], [(50, -2), (100, -2)], '<predecessor ref="10"/>')
+ROAD = lanelet(10, [(0, 2), (25, 2), (50, 2)], [(0, -2), (25, -2), (50, -2)], '<successor ref="11"/>') + lanelet(
+    11, [(50, 2), (100, 2)], [(50, -2), (100, -2)], '<predecessor ref="10"/>'
+)
 """Two lanelets in a row, 4 m wide, along y = 0."""
 
 

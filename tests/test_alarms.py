@@ -115,9 +115,7 @@ def test_skipped_updates_are_recorded_and_told_once(store, tmp_path, altered, ca
     out, sparse = tmp_path / "run", tmp_path / "sparse"
     train(tiny("bc", store, out, steps=6))
     assert read_metrics(out)[1]["gradient_norm_policy"] is None
-    assert (
-        capsys.readouterr().err.count("warning: a gradient of the policy network is not finite; skipped") == 1
-    )
+    assert capsys.readouterr().err.count("warning: a gradient of the policy network is not finite; skipped") == 1
     # A run that goes on counts on.
     for last in ("6", "4"):
         shutil.rmtree(choose(out, last))
@@ -167,9 +165,7 @@ def test_training_gives_up_with_one_line(store, tmp_path, altered, capsys):
     command = f"train bc --data {store} --out {tmp_path}/run --wandb disabled {small}"
     assert main(command.split()) == 1
     *_, last = capsys.readouterr().err.strip().splitlines()
-    assert last.startswith(
-        "symphony: error: the gradient of the policy network (loss_policy is inf) was not finite"
-    )
+    assert last.startswith("symphony: error: the gradient of the policy network (loss_policy is inf) was not finite")
     assert choose(tmp_path / "run").name.endswith(str(4 + PATIENCE - 2))
 
 

@@ -183,6 +183,4 @@ def test_a_hunt_says_no_zero_for_what_it_does_not_know(store, tmp_path, capsys):
     # Nobody is hit: the rate is 0 as far as was seen, and has no error; no light is there to be run.
     zero = json.loads(told("log", "0", "zero", "--json", "-")[1])[-1]
     assert (zero["rate"], zero["error"]) == (0.0, None)
-    assert re.search(
-        r"mean of 0 +– +– +0 of 0 +0\n", told("log", "2", "dark", "--metric", "red_light_rate")[1]
-    )
+    assert re.search(r"mean of 0 +– +– +0 of 0 +0\n", told("log", "2", "dark", "--metric", "red_light_rate")[1])

@@ -248,10 +248,7 @@ def test_convert_reports_what_it_did(tmp_path: Path, monkeypatch: Any, capsys: A
     assert "2 converted, 4 skipped" in captured.err
     assert SegmentStore(out).ids == ["one", "two"]
     assert SegmentStore(out)[0].dt == pytest.approx(0.4)
-    assert (
-        main(["data", "convert", "interaction", *logs, "--out", f"{out}-2", "--window", "4", "--egos", "all"])
-        == 0
-    )
+    assert main(["data", "convert", "interaction", *logs, "--out", f"{out}-2", "--window", "4", "--egos", "all"]) == 0
     settings = SegmentStore(out).report["settings"]
     assert (settings["rate"], settings["interactive"], settings["smooth"]) == (2.5, 3, 0.1)
 
@@ -326,9 +323,7 @@ def test_doctor_simulates_and_says_what_is_there(capsys: pytest.CaptureFixture[s
 
 @cache
 def settings(method: str, *args: str) -> TrainConfig:
-    return tyro.cli(
-        Arguments, args=expanded([method, "--data", "a", "--out", "b", "--test", "c", *args])
-    ).config
+    return tyro.cli(Arguments, args=expanded([method, "--data", "a", "--out", "b", "--test", "c", *args])).config
 
 
 @pytest.mark.parametrize("profile", PROFILES)

@@ -132,9 +132,7 @@ def test_weights_are_in_the_batch(rule):
         torch.testing.assert_close(batch[key].exp().mean(1), torch.ones(3, 8))
 
 
-@pytest.mark.parametrize(
-    "rule", [collectors.KeepBest(), collectors.Systematic(0.3), collectors.KeepAll()], ids=repr
-)
+@pytest.mark.parametrize("rule", [collectors.KeepBest(), collectors.Systematic(0.3), collectors.KeepAll()], ids=repr)
 @pytest.mark.parametrize("agents", [None, 2])
 @pytest.mark.parametrize("time", ["max", "mean", "sum", "last"])
 def test_what_follows_an_end_changes_nothing(rule, agents, time):
@@ -190,9 +188,7 @@ def test_keep_best_keeps_the_lowest(totals, fraction):
     assert parents == [kept[i % len(kept)] for i in range(len(totals))]
 
 
-@given(
-    st.lists(ODD, min_size=1, max_size=12), st.lists(NOISE, min_size=12, max_size=12), st.floats(0.01, 100)
-)
+@given(st.lists(ODD, min_size=1, max_size=12), st.lists(NOISE, min_size=12, max_size=12), st.floats(0.01, 100))
 def test_copies_are_proportional(totals, noise, temperature):
     """A branch of weight w gets as many copies of S w as its scheme promises; the best that goes on is in slot 0."""
     given_totals = torch.tensor([totals])

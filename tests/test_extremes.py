@@ -74,9 +74,7 @@ def placed(position: Any, segment: schema.RunSegment) -> schema.RunSegment:
 
 def far_away() -> schema.RunSegment:
     base = road()
-    shift = np.array(
-        [schema.MAX_COORDINATE - 400, -schema.MAX_COORDINATE + 400, schema.MAX_HEIGHT - 1], np.float32
-    )
+    shift = np.array([schema.MAX_COORDINATE - 400, -schema.MAX_COORDINATE + 400, schema.MAX_HEIGHT - 1], np.float32)
     moved = {
         name: dataclasses.replace(getattr(base.road, name), points=getattr(base.road, name).points + shift)
         for name in ("lanes", "boundary", "marks")
@@ -95,9 +93,7 @@ def zigzag() -> schema.RunSegment:
     """A lane that turns back at every point, and follows itself."""
     xs = np.arange(60) % 2 * 3.0
     lanes = [np.stack([xs, np.zeros(60)], -1), line((5, 5), (5, 5), (5, 5))]
-    return road().replace(
-        road=make_road(lanes, successors=[(0, 0), (0, 1), (1, 0)], left=[(0, 0)], right=[(0, 1)])
-    )
+    return road().replace(road=make_road(lanes, successors=[(0, 0), (0, 1), (1, 0)], left=[(0, 0)], right=[(0, 1)]))
 
 
 def logged_twice() -> schema.RunSegment:
@@ -133,9 +129,7 @@ SCENES: dict[str, Callable[[], schema.RunSegment]] = {
     "one lane": lambda: road(num_lanes=1),
     "seen at the first two steps only": lambda: only(road(), np.arange(STEPS) < 2),
     "seen now and then": lambda: only(road(), (np.arange(STEPS) + np.arange(3)[:, None]) % 3 < 2),
-    "all but two vanish": lambda: only(
-        road(num_agents=6), (np.arange(6)[:, None] < 2) | (np.arange(STEPS) < 1)
-    ),
+    "all but two vanish": lambda: only(road(num_agents=6), (np.arange(6)[:, None] < 2) | (np.arange(STEPS) < 1)),
     "the shortest log": lambda: road(steps=2),
     "all standing": lambda: placed([(20, 0), (40, 0), (60, 3.5)], road()),
     "all in reverse": lambda: moving(-10.0),
@@ -146,14 +140,10 @@ SCENES: dict[str, Callable[[], schema.RunSegment]] = {
     "the longest time step": lambda: moving(10.0, dt=schema.MAX_DT),
     "the smallest boxes": lambda: road().replace(size=np.full((3, 3), schema.MIN_SIZE, "f4")),
     "the largest boxes": lambda: road().replace(size=np.full((3, 3), schema.MAX_SIZE - 0.5, "f4")),
-    "headings turned often": lambda: road().replace(
-        heading=road().heading + np.float32(schema.MAX_HEADING - 10)
-    ),
+    "headings turned often": lambda: road().replace(heading=road().heading + np.float32(schema.MAX_HEADING - 10)),
     "at the edge of the world": far_away,
     "pedestrians only": lambda: road().replace(agent_type=np.full(3, schema.AgentType.PEDESTRIAN, np.uint8)),
-    "unknown kinds of agents": lambda: road().replace(
-        agent_type=np.full(3, schema.AgentType.UNSET, np.uint8)
-    ),
+    "unknown kinds of agents": lambda: road().replace(agent_type=np.full(3, schema.AgentType.UNSET, np.uint8)),
     "widths and limits unknown": lambda: with_road(
         road(), lane_width=np.full(3, np.nan, "f4"), speed_limit=np.full(3, np.nan, "f4")
     ),
@@ -273,9 +263,7 @@ def test_weights_that_are_not_finite_are_found_at_once(store, network, space, ce
         return
     name = {"goals": "goal policy"}.get(network, network)
     step = 1 if network == "discriminator" else 0
-    expected = (
-        f"segment straight-0: the {name} put out a number that is not finite for agent 0 at step {step}"
-    )
+    expected = f"segment straight-0: the {name} put out a number that is not finite for agent 0 at step {step}"
     with pytest.raises(NotFiniteError, match=expected) as caught:
         evaluate(broken, store, config)
     assert isinstance(caught.value, SymphonyError)

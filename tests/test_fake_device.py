@@ -26,9 +26,7 @@ from symphony.roadgraph import LaneGraph
 from symphony.rollouts.background import CarFollower
 from symphony.rollouts.unroll import simulate, start_states
 
-EVERYTHING = ObservationConfig(
-    3, 60, 2, route=True, along=True, gaps=True, clearance=True, foresight=(0.5, 1.0)
-)
+EVERYTHING = ObservationConfig(3, 60, 2, route=True, along=True, gaps=True, clearance=True, foresight=(0.5, 1.0))
 MANY, NOTHING = ObservationConfig(16, 4000), ObservationConfig.nothing()
 ROADS = collate([scene(s, [0, 1], LaneGraph(s.road)) for s in (straight_road(), crossing(6))])
 

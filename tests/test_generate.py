@@ -157,9 +157,7 @@ def test_other_arguments_and_stores_are_refused(tmp_path: Path, segments: list[R
 @pytest.mark.usefixtures("fake")
 def test_networks_in_vain_come_to_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(generation, "harvest", lambda task: Harvest(task, [], reasons=Counter(overlap=3)))
-    with pytest.raises(
-        DataError, match=rf"{generation.BARREN} networks(.|\n)*{3 * generation.BARREN} x overlap"
-    ):
+    with pytest.raises(DataError, match=rf"{generation.BARREN} networks(.|\n)*{3 * generation.BARREN} x overlap"):
         generate(Plan(3), tmp_path)
 
 
@@ -417,11 +415,7 @@ def test_lanes_lie_where_opendrive_has_them(tmp_path: Path) -> None:
     for begin, end, *curves in zip(knots, knots[1:], bend, bend[1:], strict=False):
         k, (first, last) = 100 * begin, curves
         at = f's="{begin}" x="{place[k, 0]}" y="{place[k, 1]}" hdg="{turn[k]}" length="{end - begin}"'
-        shape = (
-            f'<spiral curvStart="{first}" curvEnd="{last}"/>'
-            if first != last
-            else f'<arc curvature="{first}"/>'
-        )
+        shape = f'<spiral curvStart="{first}" curvEnd="{last}"/>' if first != last else f'<arc curvature="{first}"/>'
         pieces += f"<geometry {at}>{shape if first or last else '<line/>'}</geometry>"
     link = "".join(f'<{name} id="{{0}}"/>' for name in ("predecessor", "successor"))
     made = {k: LANE.format(k, width, link.format(k)) for k, width in ((1, 3), (-1, 3.5), (-2, 3))}

@@ -267,9 +267,7 @@ def test_blame_is_what_came_of_an_action_beyond_the_mean_of_the_other_branches(s
         for first in range(found.shape[2]):
             for t in range(first, found.shape[2]):
                 if there[b, s, t, n]:
-                    hit, off = (
-                        leaves["next", k][b, s, t, n, 0].item() for k in (keys.COLLISION, keys.OFFROAD)
-                    )
+                    hit, off = (leaves["next", k][b, s, t, n, 0].item() for k in (keys.COLLISION, keys.OFFROAD))
                     to_go[b, s, first, n] -= fade ** (t - first) * (COLLIDED * hit + OFF_ROAD * env.dt * off)
                     if hit:
                         break

@@ -14,9 +14,7 @@ from helpers_store import fill
 
 MOST = 60
 """Modules of the package that plain behavioural cloning reaches, at most."""
-UNUSED = (
-    "cli collectors envs.driving evaluation metrics render planners.interface rollouts.unroll rollouts.search"
-)
+UNUSED = "cli collectors envs.driving evaluation metrics render planners.interface rollouts.unroll rollouts.search"
 ROOMS = "agents config envs modules learning objectives roadgraph rollouts training wosac"
 
 

@@ -34,9 +34,7 @@ def test_regions_of_a_crossing():
 
 
 @settings(max_examples=25, deadline=None)
-@given(
-    st.floats(3, 100), st.floats(10, 170), st.sampled_from([-1, 1]), st.floats(-180, 180), st.floats(0.1, 0.4)
-)
+@given(st.floats(3, 100), st.floats(10, 170), st.sampled_from([-1, 1]), st.floats(-180, 180), st.floats(0.1, 0.4))
 def test_curvature_of_an_arc_is_one_over_its_radius(radius, sweep, side, begin, spacing):
     line = arc((3, 4), radius, begin, begin + side * sweep, spacing=spacing)
     (curvature,) = LaneGraph(make_road({"a": line})[0]).curvature

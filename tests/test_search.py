@@ -368,9 +368,7 @@ def test_lines_avoid_what_they_are_judged_by(store, monkeypatch):
 
 def test_who_begins_again_draws_goals_anew(store, monkeypatch):
     module = sys.modules["symphony.rollouts.search"]
-    monkeypatch.setattr(
-        module, "Backtrack", lambda *given, **named: Backtrack(*given, **named, back=(1, 0), cap=2.0)
-    )
+    monkeypatch.setattr(module, "Backtrack", lambda *given, **named: Backtrack(*given, **named, back=(1, 0), cap=2.0))
     config = replace(LINES, score="flags", threshold=-1.0, rollouts=8)  # bad whatever happens
     none, lines, logged = (
         crowds(store, [0, 2], how)

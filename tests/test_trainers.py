@@ -213,9 +213,7 @@ def test_nothing_below_the_recipes_names_a_method() -> None:
     found, looked = [], 0
     for path in sorted(SOURCE.rglob("*.py")):
         where = path.relative_to(SOURCE)
-        if where.parts[0] in MAY_NAME_METHODS or (
-            where.parts[0] == "evaluation" and path.name in ROWS_OF_TABLES
-        ):
+        if where.parts[0] in MAY_NAME_METHODS or (where.parts[0] == "evaluation" and path.name in ROWS_OF_TABLES):
             continue
         lines = enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
         found += [f"{where}:{k}" for k, line in lines if word.search(line) and "``" not in line]
@@ -225,15 +223,11 @@ def test_nothing_below_the_recipes_names_a_method() -> None:
 
 
 COMMON = "--steps 3 --states 16 --agent.hidden 8 --agent.num-points 10 --wandb disabled --rollouts 2"
-SEARCH = (
-    "--search.branches 2 --search.prune-every 3 --search.test-branches 2 --search.updates 2 --search.states 8"
-)
+SEARCH = "--search.branches 2 --search.prune-every 3 --search.test-branches 2 --search.updates 2 --search.states 8"
 ADVERSARIAL = "--mgail.regression 1 --mgail.head-start 1 --mgail.rollouts 2"
 ARGUMENTS = {"bc": COMMON, "bc_h": COMMON}
 ARGUMENTS |= dict.fromkeys(("bc_ts", "bc_ts_h", "bc_rl_h"), f"{COMMON} {SEARCH} --checkpoint-every 2")
-ARGUMENTS |= dict.fromkeys(
-    ("mgail", "mgail_h", "mgail_ts", "mgail_ts_h"), f"{ARGUMENTS['bc_ts']} {ADVERSARIAL}"
-)
+ARGUMENTS |= dict.fromkeys(("mgail", "mgail_h", "mgail_ts", "mgail_ts_h"), f"{ARGUMENTS['bc_ts']} {ADVERSARIAL}")
 
 
 @pytest.fixture

@@ -74,9 +74,7 @@ def test_a_folder_runs_no_code(stranger: Callable[..., Path], setting: str, plac
 @pytest.mark.filterwarnings("always::symphony.errors.DataWarning")
 def test_trusted_code_is_named_and_runs(stranger: Callable[..., Path], capsys: Any) -> None:
     folder = stranger(agent__encoder="stranger/notes.py:Encoder")
-    with pytest.warns(
-        DataWarning, match=r"agent\.json: agent\.encoder runs code, 'stranger/notes\.py:Encoder'"
-    ):
+    with pytest.warns(DataWarning, match=r"agent\.json: agent\.encoder runs code, 'stranger/notes\.py:Encoder'"):
         assert load_agent(str(folder), trust_code=True).policy is not None
     assert Path("ran").exists()
     data = ("--data", str(builtin_store("test")))
@@ -130,9 +128,7 @@ def npz(path: Path, members: dict[str, tuple[tuple[int, ...], int]]) -> None:
 
 def shard(path: Path, size: int, tag: bytes = b"\x0a", kind: bytes = tarfile.REGTYPE) -> None:
     """A submission with one member: a message of so many bytes of zeros, or a header of the archive's own."""
-    length = bytes(
-        (size >> 7 * k & 0x7F) | (0x80 if size >> 7 * (k + 1) else 0) for k in range(5) if size >> 7 * k
-    )
+    length = bytes((size >> 7 * k & 0x7F) | (0x80 if size >> 7 * (k + 1) else 0) for k in range(5) if size >> 7 * k)
     head = tag + length if kind == tarfile.REGTYPE else b""
     member = tarfile.TarInfo("a.binproto-00000-of-00001")
     member.size, member.type = len(head) + size, kind

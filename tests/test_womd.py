@@ -214,9 +214,7 @@ def test_a_real_record(real: RunSegment, summary: dict[str, Any]) -> None:
     limits = [lane["speed_limit_mph"] * MPS or np.nan for lane in lanes]
     np.testing.assert_allclose(real.road.speed_limit, limits, rtol=1e-6)
     index = {lane["id"]: k for k, lane in enumerate(lanes)}
-    beside = (
-        [[n["feature_id"] for n in lane[f"{side}_neighbors"]] for lane in lanes] for side in ("left", "right")
-    )
+    beside = ([[n["feature_id"] for n in lane[f"{side}_neighbors"]] for lane in lanes] for side in ("left", "right"))
     ways = ([lane[f"{way}_lanes"] for lane in lanes] for way in ("exit", "entry"))
     road, nexts = real.road, real.road.successors
     pairs = (nexts, nexts[:, ::-1], road.left_neighbors, road.right_neighbors)

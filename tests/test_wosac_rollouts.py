@@ -440,9 +440,7 @@ def test_the_record_has_the_score_and_tables_have_its_columns(tmp_path, capsys, 
     # The table of scores.
     for agents, drivers in ((whole, [*BASELINES, "random"]), ({RANDOM: whole[RANDOM]}, [])):
         rows = [
-            line.split("|")[1:]
-            for line in wosac_table(scores | {"agents": agents}).splitlines()
-            if line[:2] == "| "
+            line.split("|")[1:] for line in wosac_table(scores | {"agents": agents}).splitlines() if line[:2] == "| "
         ]
         assert [row[0].strip() for row in rows] == ["", "---", *drivers, "random, no search"]
         for column, cell in zip(COLUMNS, rows[-1][1:], strict=False):

@@ -99,9 +99,7 @@ def updated(root: Path) -> str:
 
 def main(args: list[str] | None = None) -> int:
     """Report on the repository this program lies in; status 1 if anything is too long."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--update", action="store_true", help="write sizes of today into the table")
     if parser.parse_args(args).update:
         (ROOT / TABLE).write_text(updated(ROOT), encoding="utf-8")

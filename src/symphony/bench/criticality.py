@@ -96,9 +96,7 @@ def criticality(found: RunSegment | SavedRollouts, rollout: int | None = None) -
     )
 
 
-def _encroachment(
-    world: World, segment: RunSegment, seen: NDArray[np.int64], ego: NDArray[np.object_]
-) -> float:
+def _encroachment(world: World, segment: RunSegment, seen: NDArray[np.int64], ego: NDArray[np.object_]) -> float:
     """Least seconds between the boxes of the ego and of one who crosses its way, at the same place at two steps."""
     who, step = world.valid.nonzero()
     who, step = who[who != segment.ego], step[who != segment.ego]

@@ -116,9 +116,7 @@ def measured(runs: Sequence[Run], measure: Measure, confidence: float = 0.95) ->
     return estimate([measure.of(run) for run in runs], groups, confidence, measure.kind)
 
 
-def _rate_bound(
-    value: NDArray[np.float64], group: NDArray[np.int64], groups: int, confidence: float
-) -> float:
+def _rate_bound(value: NDArray[np.float64], group: NDArray[np.int64], groups: int, confidence: float) -> float:
     """Upper bound of a rate from 0 to 1 (Korn and Graubard).
 
     The scatter between groups is taken with one more group in which it always happened: of a rare event that some

@@ -116,9 +116,7 @@ class Hunt:
                 values = [MEASURES[self.metric].of(run) for run in report.rows]
                 hits = np.array([bool(value) for value in values]).reshape(weight[b].shape)
                 lost = sorted(saved.failed.items()) if self.metric != "failed_rate" else []
-                why = (
-                    f"failed in {len(lost)} of {saved.rollouts} runs, the first: {lost[0][1]}" if lost else ""
-                )
+                why = f"failed in {len(lost)} of {saved.rollouts} runs, the first: {lost[0][1]}" if lost else ""
                 kept = _kept(saved, hits & (not why))
                 known = np.nan if None in values else 1.0
                 out.append((kept, _rate(kept, (hits * weight[b]).mean(-1) * known, why)))
@@ -200,9 +198,7 @@ def remarks(found: list[Rate]) -> list[str]:
     if any(one.rate > 1 for one in found):
         out.append("a rate came to more than 100 %: take more branches")
     if rough := sum(0 < one.trees < FEW for one in found):
-        out.append(
-            f"{rough} of the rates and errors are rough: fewer than {FEW} trees show it, take more trees"
-        )
+        out.append(f"{rough} of the rates and errors are rough: fewer than {FEW} trees show it, take more trees")
     if found[-1].rate == 0:
         out.append("no run shows it: it may be too rare for so few trees and branches, which bounds no rate")
     return out

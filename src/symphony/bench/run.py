@@ -201,9 +201,7 @@ def _drive(suite: Suite, pair: Pair, progress: Progress) -> None:
         pair.report.rows += with_pdm(found, folder)
         pair.report.events |= found.events
         # The rest need not be simulated where some threshold can't be kept any more.
-        if pair.planner.name != suite.baseline and any(
-            _beyond(one, pair) for one in _thresholds(suite, pair)
-        ):
+        if pair.planner.name != suite.baseline and any(_beyond(one, pair) for one in _thresholds(suite, pair)):
             break
     pair.seconds = time.perf_counter() - began
 

@@ -271,9 +271,7 @@ def _crowd(table: _Table, shared: dict[str, Any]) -> Crowd:
     return Crowd(table.named(), agent, config)
 
 
-def _threshold(
-    table: _Table, names: dict[str, list[str]], sure: float, groups: int, compares: bool
-) -> Threshold:
+def _threshold(table: _Table, names: dict[str, list[str]], sure: float, groups: int, compares: bool) -> Threshold:
     """A threshold that some planner could keep with segments of so many groups."""
     given, confidence = table.given, table.given.get("confidence", sure)
     if given["metric"] not in MEASURES:

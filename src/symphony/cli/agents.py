@@ -218,9 +218,7 @@ class Demo(shared.Command):
         more |= {"data": symphony.builtin_store("train"), "out": run, "steps": self.steps, "seed": self.seed}
         symphony.train(symphony.TrainConfig(method="bc_h", **more))
         show({"your BC+H": str(run)}, self.out / "rollouts.png")
-        shared.say(
-            f"numbers: {numbers}\nagent:   {run}\nnext:    symphony test examples/suite.toml tests a planner"
-        )
+        shared.say(f"numbers: {numbers}\nagent:   {run}\nnext:    symphony test examples/suite.toml tests a planner")
 
 
 class Doctor(shared.Command):

@@ -87,9 +87,7 @@ class Segment(shared.Command):
             raise errors.ConfigError(f"--step {self.step}: the segment has {segment.num_steps} steps")
         choice = interactive_choice(segment, self.interactive)
         title = segment.segment_id + (f" ({choice.context})" if choice.context else "")
-        render.plot_segment(
-            segment, self.out, step=self.step, interactive=choice.agents.tolist(), title=title
-        )
+        render.plot_segment(segment, self.out, step=self.step, interactive=choice.agents.tolist(), title=title)
 
 
 class Routes(shared.Command):

@@ -36,9 +36,7 @@ class Simulate(shared.Simulation):
     #: for one that comes past a point (metres, in the frame of the segment); all others as the agent draws them.
     goal: Annotated[tuple[str, ...], arg(metavar="ID=PLACE ...")] = ()
     tree: bool = True  # Leave out the branches that a search pruned.
-    config: Annotated[evaluation.SimulateConfig, arg(name="")] = field(
-        default_factory=evaluation.SimulateConfig
-    )
+    config: Annotated[evaluation.SimulateConfig, arg(name="")] = field(default_factory=evaluation.SimulateConfig)
 
     def __post_init__(self) -> None:
         evaluation.check_planner_seconds(self.planner_seconds)

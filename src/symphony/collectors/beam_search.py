@@ -203,9 +203,7 @@ def beam_search(
     del records
     tree.refine_names(..., "time")
     simulated_scores, counted = torch.cat(scores, -2), torch.cat(alive, -2).any(-1)
-    totals, seen, parents = (
-        torch.stack(part, -2) for part in (pruning.totals, pruning.seen, pruning.parents)
-    )
+    totals, seen, parents = (torch.stack(part, -2) for part in (pruning.totals, pruning.seen, pruning.parents))
     slots, (log_weights, evidence) = lineage(parents), pruning.last_weights()
     # In later periods all branches of a row that has ended are equal.
     last_period = (torch.stack(pruning.active, -1).sum(-1) - 1).clamp_min(0)[..., None, None]

@@ -53,9 +53,7 @@ def check(told: str, value: Any, hint: Any) -> None:
                 raise ConfigError(f"{told}: {Counter(value).most_common(1)[0][0]} is given twice")
         elif isinstance(mark, Bounds) and value is not None and not mark.least <= value <= mark.most:
             least = LEAST.get(mark.least, f"be at least {mark.least}")
-            raise ConfigError(
-                f"{told} must {f'be at most {mark.most}' if value > mark.most else least}, is {value}"
-            )
+            raise ConfigError(f"{told} must {f'be at most {mark.most}' if value > mark.most else least}, is {value}")
         elif isinstance(mark, Names) and value not in mark and ":" not in value:
             more = "or an import path such as my.module:Name"
             raise ConfigError(f"{told} is one of {', '.join(mark)} {more}, not '{value}'")

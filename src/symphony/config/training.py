@@ -143,9 +143,7 @@ class TrainConfig(RunConfig):
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
     mgail: MGAILConfig = field(default_factory=MGAILConfig)  # Adversarial learning (methods mgail*).
 
-    def spec(
-        self, action_space: ActionSpace, dt: float, *, discriminator: bool = False, **more: Any
-    ) -> AgentSpec:
+    def spec(self, action_space: ActionSpace, dt: float, *, discriminator: bool = False, **more: Any) -> AgentSpec:
         """What the agent is that a recipe trains.
 
         Args:

@@ -340,9 +340,7 @@ def _begin(job: Job, folder: Path) -> None:
     write_json(folder / JOB, asdict(job))
 
 
-def _collected(
-    how: Preparation, job: Job, folder: Path, workers: int, engine: Engine, tell: Progress
-) -> Report:
+def _collected(how: Preparation, job: Job, folder: Path, workers: int, engine: Engine, tell: Progress) -> Report:
     """Make the parts that are missing, and copy what they hold, in their order, into one store."""
     tasks = tasks_of(how, job.files, folder / PARTS)
     report = Report(settings=dict(job.settings))

@@ -370,9 +370,7 @@ class DrivingEnv(EnvBase):
 
     def _read(self, tensordict: TensorDictBase) -> State:
         scene, step, stream = (tensordict.get(k).squeeze(-1) for k in (keys.SCENE, keys.STEP, keys.STREAM))
-        state, valid, goal, progress = (
-            tensordict.get(k) for k in (keys.STATE, keys.VALID, keys.GOAL, keys.PROGRESS)
-        )
+        state, valid, goal, progress = (tensordict.get(k) for k in (keys.STATE, keys.VALID, keys.GOAL, keys.PROGRESS))
         waiting = tensordict.get(keys.WAITING) if self.open_traffic else None
         return State(scene, step, stream, state, valid, goal, progress, waiting)
 
@@ -383,9 +381,7 @@ class DrivingEnv(EnvBase):
         moved, real, goal, progress = _flat(len(shape), now.state, now.valid, now.goal, now.progress)
         follows = self.observation.route or self.observation.along
         along: dict[str, Tensor] = {"goal": goal, "progress": progress} if follows else {}
-        seen, objects = observe_states(
-            scenes, row, at, moved, real, self.observation, tables=self._kept(), **along
-        )
+        seen, objects = observe_states(scenes, row, at, moved, real, self.observation, tables=self._kept(), **along)
         index = scenes.interactive.index_select(0, row)
         with torch.no_grad():
             collision = collision_flags(objects, index) & real

@@ -65,9 +65,7 @@ def bicycle_inverse(state: States, after: States, length: Reals, dt: float) -> t
     return acceleration, torch.where(moving, torch.atan(2.0 * torch.tan(slip)), 0.0)
 
 
-def displacement_step(
-    state: States, displacement: Float[Tensor, "*#b 2"], length: Reals, dt: float
-) -> States:
+def displacement_step(state: States, displacement: Float[Tensor, "*#b 2"], length: Reals, dt: float) -> States:
     """Move the box centre by ``displacement`` (x forward, y left, metres, in the agent's own frame).
 
     The rear axle, half a wheelbase r behind the centre, is dragged along (a tractrix, dheading = sin(phi) / r

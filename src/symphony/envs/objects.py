@@ -101,9 +101,7 @@ def objects_at(
     """
     steps, agents = scenes.log_valid.shape[1:]
     row = scene * steps + step.clamp(max=steps - 1)
-    logged, valid = (
-        table.flatten(0, 1).index_select(0, row) for table in (scenes.log_state, scenes.log_valid)
-    )
+    logged, valid = (table.flatten(0, 1).index_select(0, row) for table in (scenes.log_state, scenes.log_valid))
     size = scenes.box_size.index_select(0, scene)
     valid = valid & (step <= scenes.last_step.index_select(0, scene))[:, None]
     height = None
@@ -227,9 +225,7 @@ def observed_objects(
 
 
 @torch.no_grad()
-def _nearest(
-    objects: Objects, who: Observers, count: int
-) -> tuple[Int[Tensor, "M N O"], Bool[Tensor, "M N O"]]:
+def _nearest(objects: Objects, who: Observers, count: int) -> tuple[Int[Tensor, "M N O"], Bool[Tensor, "M N O"]]:
     """Places in the scene of the nearest others, and which of them exist."""
     x, y = (objects.state[:, None, :, k] - who.state[..., k, None] for k in (0, 1))
     return nearest(torch.where(objects.others(who.agent), x.square() + y.square(), torch.inf), count)
@@ -259,9 +255,7 @@ def _features(
     return torch.cat([torch.stack(dynamic, -1), static], -1) * mask.to(state.dtype)[..., None]
 
 
-def _gaps(
-    foresight: tuple[float, ...], who: Observers, state: Tensor, size: Tensor
-) -> Float[Tensor, "M N O H"]:
+def _gaps(foresight: tuple[float, ...], who: Observers, state: Tensor, size: Tensor) -> Float[Tensor, "M N O H"]:
     """Gaps to boxes [M, N, O] now and at times ahead, were everyone to keep speed and course."""
     # Times come first, and components apart, so that operations run along everything else.
     times = constant((0.0, *foresight), state.dtype, state.device)[:, None, None, None]

@@ -242,9 +242,7 @@ class RouteWindow(NamedTuple):
     own: Tensor  # [M, N] int64 the one that is nearest to where the agent has come to, or the last but one
 
 
-def route_ahead(
-    state: Float[Tensor, "M N 4"], routes: RouteWindow, distance_scale: float
-) -> Float[Tensor, "M N F"]:
+def route_ahead(state: Float[Tensor, "M N 4"], routes: RouteWindow, distance_scale: float) -> Float[Tensor, "M N F"]:
     """What each agent observes of its route, in its own frame.
 
     Whether it has one, how far to the left the route lies (metres / 5), its direction, then position and existence of

@@ -260,9 +260,7 @@ def few(size: int) -> int:
     return size if size <= COORDINATES else -(-size // step) * step
 
 
-def collate(
-    scenes: Sequence[SceneBatch], agents: int = 0, shapes: dict[str, list[int]] | None = None
-) -> SceneBatch:
+def collate(scenes: Sequence[SceneBatch], agents: int = 0, shapes: dict[str, list[int]] | None = None) -> SceneBatch:
     """Stack scenes into one batch, padded to the largest of each size, and to so many interactive agents.
 
     Padded steps repeat nothing: they are masked by ``log_valid`` and lie past ``last_step``. ``shapes`` of batches so
@@ -354,9 +352,7 @@ def _points(segment: RunSegment, levels: Levels) -> dict[str, NDArray[Any]]:
     edge = np.full(len(road.boundary), PointType.BOUNDARY)
     groups: list[tuple[Polylines, NDArray[Any], NDArray[Any]]]
     groups = [(road.lanes, bike, np.nan_to_num(road.speed_limit))]
-    groups += [
-        (lines, kind, np.zeros(len(lines))) for lines, kind in ((road.boundary, edge), (road.marks, marks))
-    ]
+    groups += [(lines, kind, np.zeros(len(lines))) for lines, kind in ((road.boundary, edge), (road.marks, marks))]
     lights = len(segment.signal_lane)
     ends = np.array([road.lanes[int(lane)][-1, :2] for lane in segment.signal_lane], np.float32)
     ahead = _unit(ends.reshape(-1, 2) - segment.signal_point[:, :2])

@@ -67,9 +67,7 @@ class Report:
     events: dict[str, list[Event]] = field(default_factory=dict)  # of each segment, marked in its replay
     collision_in: dict[str, Array] = field(default_factory=dict)  # of each segment, seconds [K, T, N]
     # Sums over runs that did not fail, in the log and past its end: seconds of agents, and what happened in them.
-    parts: tuple[dict[str, float], ...] = field(
-        default_factory=lambda: tuple(map(defaultdict, [float, float]))
-    )
+    parts: tuple[dict[str, float], ...] = field(default_factory=lambda: tuple(map(defaultdict, [float, float])))
 
     def replay(self, saved: SavedRollouts) -> Replay:
         """Return what a viewer shows of a segment; nothing is marked in one that was not evaluated."""

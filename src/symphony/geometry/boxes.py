@@ -42,9 +42,7 @@ def meeting_time(
         *turned(speed[..., 0], speed[..., 1], heading_b),
     )
     begin, end = torch.zeros_like(pair.in_a[0]), torch.full_like(pair.in_a[0], math.inf)
-    for at, gain, cover in zip(
-        (*pair.in_a, *pair.in_b), gains, covers(pair.turn, size_a, size_b), strict=True
-    ):
+    for at, gain, cover in zip((*pair.in_a, *pair.in_b), gains, covers(pair.turn, size_a, size_b), strict=True):
         slow = gain.abs() < _SLOW
         rate = torch.where(slow, 1.0, gain)
         one, two = (-cover - at) / rate, (cover - at) / rate
@@ -151,9 +149,7 @@ def box_gap(
     return gap_between(*_way(center_a, center_b), heading_a, size_a, heading_b, size_b)
 
 
-def gap_between(
-    x: Angles, y: Angles, heading_a: Angles, size_a: Pairs, heading_b: Angles, size_b: Pairs
-) -> Reals:
+def gap_between(x: Angles, y: Angles, heading_a: Angles, size_a: Pairs, heading_b: Angles, size_b: Pairs) -> Reals:
     """:func:`box_gap` of boxes whose centres are ``x`` and ``y`` metres apart, seen from a."""
     pair = relation(x, y, heading_a, heading_b)
     separation, back = _separations(pair, size_a, size_b), (-pair.in_b[0], -pair.in_b[1])

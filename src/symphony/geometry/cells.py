@@ -44,9 +44,7 @@ class Cells(ABC):
     cell, the elements per map, padding included, and how many are looked for.
     """
 
-    def __init__(
-        self, low: Reals, high: Reals, some: Bools, size: float, *, total: int, wanted: int = 1
-    ) -> None:
+    def __init__(self, low: Reals, high: Reals, some: Bools, size: float, *, total: int, wanted: int = 1) -> None:
         self.total, self.wanted = total, wanted
         low, high = (np.where(some[:, None], value, 0.0).astype(np.float64) for value in (low, high))
         low = np.floor(low - _MARGIN)
@@ -175,9 +173,7 @@ class EdgeCells(Cells):
     E], and the numbers of the edges before and after each [B * E], -1 if none.
     """
 
-    def __init__(
-        self, start: Reals, end: Reals, exists: Bools, previous: Indices, following: Indices
-    ) -> None:
+    def __init__(self, start: Reals, end: Reals, exists: Bools, previous: Indices, following: Indices) -> None:
         along = end - start
         length = np.hypot(along[:, 0], along[:, 1])
         unit = along / np.where(length > 0, length, 1)[:, None]

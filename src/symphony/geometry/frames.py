@@ -27,9 +27,7 @@ def rotate(vectors: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*#batch"]) 
     return torch.stack((cos * x - sin * y, sin * x + cos * y), dim=-1)
 
 
-def forward_speed(
-    velocity: Float[Tensor, "*batch 2"], heading: Float[Tensor, "*#batch"]
-) -> Float[Tensor, "*batch"]:
+def forward_speed(velocity: Float[Tensor, "*batch 2"], heading: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch"]:
     """Component of a velocity along a heading, m/s; negative when reversing."""
     return velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()
 

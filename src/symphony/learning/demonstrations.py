@@ -309,9 +309,7 @@ class SceneDataset:
         right = np.zeros(length.shape, np.bool_)
         for row, table in enumerate(tables):
             right[row, : len(table.right)] = table.right
-        state = torch.stack([e.states[k, int(t)] for (_, e, k), t in zip(chosen, when, strict=True)]).to(
-            device
-        )
+        state = torch.stack([e.states[k, int(t)] for (_, e, k), t in zip(chosen, when, strict=True)]).to(device)
         item, agent = torch.tensor([i for i, _, _ in chosen]), torch.stack([e.agent[k] for _, e, k in chosen])
         where = item.to(device), when.to(device), agent.to(device), state
         batch = expert_batch(self.scenes(items).to(device), *where, observation)

@@ -74,9 +74,7 @@ def choices(
             away.append(0.5 * float(np.abs(shares[0] - shares[1]).sum()))
             for k, goals in enumerate(both):
                 turns[k] += np.bincount(turn[b, n][goals], minlength=len(TURNS))
-        found.append(
-            Choice(turns[0], turns[1], float(np.mean(away)) if away else math.nan, float(founders[b]))
-        )
+        found.append(Choice(turns[0], turns[1], float(np.mean(away)) if away else math.nan, float(founders[b])))
     return found
 
 

@@ -18,9 +18,7 @@ def summed(values: NDArray[Any], member: NDArray[np.int64]) -> NDArray[Any]:
     return out
 
 
-def ratio(
-    total: NDArray[np.float64], weight: NDArray[np.float64], member: NDArray[np.int64]
-) -> tuple[float, float]:
+def ratio(total: NDArray[np.float64], weight: NDArray[np.float64], member: NDArray[np.int64]) -> tuple[float, float]:
     """Ratio of sums and its standard error over groups (linearised; NaN for a single one).
 
     Takes what each segment adds to numerator and denominator, and the number of its group. Groups without anything to

@@ -181,9 +181,7 @@ def _first_met(
         torch.stack([start[..., 2], after[..., 2]], -1),
         boxes,
     )
-    gap = box_gap(
-        mine_after[..., :2], mine_after[..., 2], boxes[me][:, None], after[..., :2], after[..., 2], boxes
-    )
+    gap = box_gap(mine_after[..., :2], mine_after[..., 2], boxes[me][:, None], after[..., :2], after[..., 2], boxes)
     share, gap = (torch.where(others, value, torch.inf) for value in (share, gap))
     first = share.amin(-1, keepdim=True)
     # Flags of states may differ by rounding from what is found between them.

@@ -112,10 +112,7 @@ def collisions(
     )
     parts = [(position, 3), (heading, 2), (size, 2), (valid, 2), (subject, 1)]
     parts += [] if height is None else [(height, 3)]
-    flat = [
-        value.expand(*lead, *value.shape[-inner:]).reshape(-1, *value.shape[-inner:])
-        for value, inner in parts
-    ]
+    flat = [value.expand(*lead, *value.shape[-inner:]).reshape(-1, *value.shape[-inner:]) for value, inner in parts]
     found = meetings(*flat, at_states=at_states)
     steps = valid.shape[-1] - (not at_states)
     result = torch.zeros(*flat[4].shape, steps, dtype=torch.bool, device=position.device)

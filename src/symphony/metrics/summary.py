@@ -38,9 +38,7 @@ def jensen_shannon(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.floa
     """
     counts = [np.asarray(each, dtype=np.float64) for each in (first, second)]
     totals = [each.sum(-1, keepdims=True) for each in counts]
-    p, q = (
-        np.divide(c, t, out=np.full_like(c, np.nan), where=t > 0) for c, t in zip(counts, totals, strict=True)
-    )
+    p, q = (np.divide(c, t, out=np.full_like(c, np.nan), where=t > 0) for c, t in zip(counts, totals, strict=True))
     middle = (p + q) / 2
     divergence = (_relative(p, middle) + _relative(q, middle)) / 2
     return np.maximum(divergence, 0.0)
@@ -175,9 +173,7 @@ class RolloutMetrics:
         # Sums are exact, so that padding among what is summed does not change how they are rounded.
         away = displacement.double().masked_fill(~(simulated & logged[:, None]), 0.0).flatten(2).tolist()
         kind, playback = (part.cpu().numpy() for part in kinds.first())
-        kind_logged, playback_logged = (
-            part.cpu().numpy() for part in (kinds_logged.kind, kinds_logged.playback)
-        )
+        kind_logged, playback_logged = (part.cpu().numpy() for part in (kinds_logged.kind, kinds_logged.playback))
         steps = [part.cpu().numpy() for part in (simulated, logged, at_states, offroad, speed, speed_log)]
         ends, edged = last.tolist(), bounded.tolist()
         for b, name in enumerate(segment_ids):
@@ -261,9 +257,7 @@ class RolloutMetrics:
         """The divergence, and the names of its samples: the groups."""
         found = [self.segments[name] for name in sorted(self.segments)]
         names, member = np.unique([one.group for one in found], return_inverse=True)
-        counts = (
-            np.stack(each) for each in zip(*((s.histogram, s.histogram_log) for s in found), strict=True)
-        )
+        counts = (np.stack(each) for each in zip(*((s.histogram, s.histogram_log) for s in found), strict=True))
         return sampled_divergence(*(summed(each, member) for each in counts)), names.tolist()
 
     def compute(self) -> dict[str, Any]:

@@ -207,9 +207,7 @@ class DisplacementHistogram(Distribution):
     @property
     def edges(self) -> tuple[Float[Tensor, " F1"], Float[Tensor, " L1"]]:
         """Shares [F + 1] and [L + 1] between which the cells lie."""
-        forward, left = (
-            constant(_edges(cells), self.logits.dtype, self.logits.device) for cells in self.cells
-        )
+        forward, left = (constant(_edges(cells), self.logits.dtype, self.logits.device) for cells in self.cells)
         return forward, left
 
     @property
@@ -224,8 +222,7 @@ class DisplacementHistogram(Distribution):
         # Cells of one acceleration lie side by side.
         number = torch.stack([cell // self.cells[1], cell % self.cells[1]], -1)
         low, high = (
-            torch.stack([edges[number[..., k] + more] for k, edges in enumerate(self.edges)], -1)
-            for more in (0, 1)
+            torch.stack([edges[number[..., k] + more] for k, edges in enumerate(self.edges)], -1) for more in (0, 1)
         )
         return low + (high - low) * place
 

@@ -90,9 +90,7 @@ def _maxima(function: Function, sets: Sets, valid: Masks) -> Pooled:
     return torch.where(valid.any(1, keepdim=True), best, 0.0)
 
 
-def _encoded(
-    function: Function, flat: Float[Tensor, "e F"], valid: Bool[Tensor, " e"], dim: int = 0
-) -> Tensor:
+def _encoded(function: Function, flat: Float[Tensor, "e F"], valid: Bool[Tensor, " e"], dim: int = 0) -> Tensor:
     """All elements encoded, minus infinity where they are masked; on the CPU only the others are looked at.
 
     The function gives elements along dimension ``dim``, and so does the result.

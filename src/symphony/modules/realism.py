@@ -47,9 +47,7 @@ class Discriminator(nn.Module):
         if self.clearance:
             gaps = 1 + len(encoder.FORESIGHT) if features == "foresight" else 1
             widths = (own_features + _ROAD, object_features + _GAP * gaps, point_features)
-        self.network = encoder.SceneNetwork(
-            encoder.SceneEncoder(widths[0], widths[1:], hidden=hidden), 1, head=head
-        )
+        self.network = encoder.SceneNetwork(encoder.SceneEncoder(widths[0], widths[1:], hidden=hidden), 1, head=head)
 
     def forward(
         self,
@@ -108,6 +106,4 @@ def discriminator(
         encoder.ElementGroup(POINTS, POINTS_MASK, point_features),
     )
     more = {"paper": (), "clearance": (ROAD, GAP), "foresight": (ROAD, GAP, GAP_AHEAD)}[features]
-    return encoder.scene_module(
-        network, groups, out_key, own_keys=own_keys, valid_key=valid_key, more_keys=more
-    )
+    return encoder.scene_module(network, groups, out_key, own_keys=own_keys, valid_key=valid_key, more_keys=more)

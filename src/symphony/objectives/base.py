@@ -87,23 +87,17 @@ class MaskedLoss(LossModule):
         if value is None:
             raise KeyError(f"no {what} under {key!r}")
         if value.shape != shape:
-            raise ValueError(
-                f"{what} {key!r} has shape {tuple(value.shape)}, the network's output {tuple(shape)}"
-            )
+            raise ValueError(f"{what} {key!r} has shape {tuple(value.shape)}, the network's output {tuple(shape)}")
         return value
 
-    def _flags(
-        self, tensordict: TensorDictBase, key: NestedKey, what: str, shape: torch.Size
-    ) -> Bool[Tensor, "*b"]:
+    def _flags(self, tensordict: TensorDictBase, key: NestedKey, what: str, shape: torch.Size) -> Bool[Tensor, "*b"]:
         """Likewise for bools: `~` of an integer would be another integer, silently."""
         value = self._entries(tensordict, key, what, shape)
         if value.dtype != torch.bool:
             raise ValueError(f"{what} {key!r} is {value.dtype}, expected torch.bool")
         return value
 
-    def _counted(
-        self, tensordict: TensorDictBase, shape: torch.Size, device: torch.device
-    ) -> Bool[Tensor, "*b"]:
+    def _counted(self, tensordict: TensorDictBase, shape: torch.Size, device: torch.device) -> Bool[Tensor, "*b"]:
         """Bool mask of the entries that are valid and that no mask written by TorchRL itself leaves out."""
         counted = torch.ones(shape, dtype=torch.bool, device=device)
         if self._mask(tensordict) is not None:
@@ -290,9 +284,7 @@ class BCLoss(ActorLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss of a batch that holds :attr:`in_keys`; the input is left as it is."""
         fit = self._fit(tensordict)
-        result = TensorDict(
-            {"loss_bc": self._reduced(fit.cost, fit.counted), **self._statistics(fit, fit.counted)}
-        )
+        result = TensorDict({"loss_bc": self._reduced(fit.cost, fit.counted), **self._statistics(fit, fit.counted)})
         self._clear_weakrefs(tensordict, result, "actor_network_params")
         return result
 

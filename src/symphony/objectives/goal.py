@@ -143,6 +143,4 @@ class GoalLoss(MaskedLoss):
             # Found out on the device: to look at the numbers would wait for it.
             torch._assert_async(~wrong.any(), f"label {key!r} is not one of the feasible goals")
         elif bool(wrong.any()):
-            raise ValueError(
-                f"label {key!r} at {wrong.nonzero()[0].tolist()} is not one of the feasible goals"
-            )
+            raise ValueError(f"label {key!r} at {wrong.nonzero()[0].tolist()} is not one of the feasible goals")

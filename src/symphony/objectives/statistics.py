@@ -28,9 +28,7 @@ def auc(
     valid = torch.ones_like(positive) if valid is None else valid
     for name, mask in (("positive", positive), ("valid", valid)):
         if mask.shape != scores.shape or mask.dtype != torch.bool:
-            raise ValueError(
-                f"{name} is {mask.dtype} {tuple(mask.shape)}, expected torch.bool {tuple(scores.shape)}"
-            )
+            raise ValueError(f"{name} is {mask.dtype} {tuple(mask.shape)}, expected torch.bool {tuple(scores.shape)}")
     flat = scores.detach().flatten()
     above, below = (positive & valid).flatten(), (~positive & valid).flatten()
     positives, negatives = above.sum(), below.sum()

@@ -34,9 +34,7 @@ def plans_of(planners: Sequence[Planner], seen: Sequence[Traffic], seconds: floa
         else:
             found[m] = answer(planner.plan, seen[m], seconds=seconds)
     for kind, members in together.items():
-        given = answer(
-            _batch, kind, [planners[m] for m in members], [seen[m] for m in members], seconds=seconds
-        )
+        given = answer(_batch, kind, [planners[m] for m in members], [seen[m] for m in members], seconds=seconds)
         for k, m in enumerate(members):
             found[m] = given if isinstance(given, Exception) else given[k]
     return found

@@ -265,8 +265,7 @@ class _Asked(_Driver):
         """Planned states [..., 4] and numbers of planners [...]."""
         scene, at, place = *(tensordict.get(key).flatten() for key in (keys.SCENE, keys.STEP)), self.place
         state, valid, progress = (
-            tensordict.get(key).flatten(0, tensordict.ndim - 1)
-            for key in (keys.STATE, keys.VALID, keys.PROGRESS)
+            tensordict.get(key).flatten(0, tensordict.ndim - 1) for key in (keys.STATE, keys.VALID, keys.PROGRESS)
         )
         everyone = self.env.objects(scene, at, state, valid)
         rows, steps, come = scene.tolist(), at.tolist(), progress[:, place].tolist()

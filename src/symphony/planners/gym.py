@@ -160,9 +160,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         far = shapely.LineString(told.route).project(shapely.Point(state[:2])) if len(told.route) else 0.0
         now, past = self._moment(self._now), tuple(map(self._moment, self._before))
         at = self.segment, ego, int(self._now.get(keys.STEP)), state
-        return observation_of(
-            told, traffic_of(*at, now, past, route_from(told.route, far)), lanes, crosswalks
-        )
+        return observation_of(told, traffic_of(*at, now, past, route_from(told.route, far)), lanes, crosswalks)
 
     def _moment(self, now: TensorDictBase) -> Moment:
         row, step = now.get(keys.SCENE).flatten(), now.get(keys.STEP).flatten()

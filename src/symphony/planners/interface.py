@@ -238,11 +238,7 @@ def named_planners(words: Sequence[str]) -> tuple[str, dict[int, str]]:
         elif others.setdefault(int(agent), name) != name or not name:
             raise ConfigError(f"planner '{word}': agent {agent} has another one")
     if len(egos) > 1 or (others and not egos):
-        told = (
-            f"{len(egos)} are named: {', '.join(egos)}"
-            if egos
-            else "there is none (`log` plays back its log)"
-        )
+        told = f"{len(egos)} are named: {', '.join(egos)}" if egos else "there is none (`log` plays back its log)"
         raise ConfigError(f"the ego has one planner, {told}; another agent's is such as 3=idm, by its id")
     return "".join(egos), others
 
@@ -265,9 +261,7 @@ def _needed(function: Callable[..., Any]) -> list[str]:
     return [one.name for one in found if one.kind in by_place and one.default is one.empty]
 
 
-def scenario_of(
-    segment: RunSegment, ego: int, route: NDArray[Any], state: NDArray[Any], seed: int
-) -> Scenario:
+def scenario_of(segment: RunSegment, ego: int, route: NDArray[Any], state: NDArray[Any], seed: int) -> Scenario:
     """The scenario of an agent of a run segment, for a route [P, 2], its first state [4] and a seed."""
     valid = segment.valid[ego]
     heading, velocity = segment.heading[ego].astype(np.float64), segment.velocity[ego].astype(np.float64)

@@ -127,9 +127,7 @@ class ProcessPlanner:
                 raise ValueError(f"an answer of more than {LONGEST} bytes")
         line, _, more = line.partition(b"\n")
         if more:
-            raise ValueError(
-                f"wrote more than one line for an answer: {more[:80].decode(errors='replace')!r}"
-            )
+            raise ValueError(f"wrote more than one line for an answer: {more[:80].decode(errors='replace')!r}")
         given = json.loads(line.decode())
         if isinstance(given, dict) and "error" in given:
             raise RuntimeError(str(given["error"]))

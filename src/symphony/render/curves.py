@@ -188,9 +188,7 @@ def _style(axes: Axes, title: str) -> None:
     axes.spines[["left", "bottom"]].set_color(LANE)
 
 
-def _draw_curve(
-    axes: Axes, steps: NDArray[Any], values: NDArray[Any], window: float, gid: str, **style: Any
-) -> None:
+def _draw_curve(axes: Axes, steps: NDArray[Any], values: NDArray[Any], window: float, gid: str, **style: Any) -> None:
     """A metric of a run, pale as recorded and strong smoothed."""
     axes.plot(steps, values, linewidth=0.7, alpha=0.3, gid=f"raw-{gid}", **style)
     # A lone record has no line.

@@ -199,9 +199,7 @@ def plot_rollout(clip: Clip, target: Target) -> Axes:
     return axes
 
 
-def plot_routes(
-    segment: RunSegment, agent: int, lines: Sequence[NDArray[Any]], logged: int, target: Target
-) -> Axes:
+def plot_routes(segment: RunSegment, agent: int, lines: Sequence[NDArray[Any]], logged: int, target: Target) -> Axes:
     """Draw the routes of an agent, a dot for each of their points, the one that it took on top, and its log.
 
     Takes the agent's row of the segment, the points [P, 2] of its routes, and which of them it took, -1 for none.

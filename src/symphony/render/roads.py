@@ -22,9 +22,7 @@ CORNERS = np.array([(0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5)])
 NOSE = np.array([(0.46, 0.0), (0.12, 0.36), (0.12, -0.36)])
 
 
-def place(
-    shape: NDArray[Any], position: NDArray[Any], heading: NDArray[Any], size: NDArray[Any]
-) -> NDArray[Any]:
+def place(shape: NDArray[Any], position: NDArray[Any], heading: NDArray[Any], size: NDArray[Any]) -> NDArray[Any]:
     """Put a shape [V, 2], fractions of length and width along and left of the heading, into the world [A, V, 2]."""
     local = shape * size[:, None, :2]
     ahead = np.stack([np.cos(heading), np.sin(heading)], -1)[:, None]

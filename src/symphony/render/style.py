@@ -46,9 +46,7 @@ def new_figure(width: float = 8.0, height: float = 8.0) -> Figure:
     return figure
 
 
-def new_panels(
-    count: int, columns: int, width: float, height: float, head: float = 0.0
-) -> tuple[Figure, list[Axes]]:
+def new_panels(count: int, columns: int, width: float, height: float, head: float = 0.0) -> tuple[Figure, list[Axes]]:
     """A figure of panels, each so many inches wide and high, with room above them."""
     rows = -(-count // columns)
     figure = new_figure(width * columns, height * rows + head)

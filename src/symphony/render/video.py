@@ -70,9 +70,7 @@ def write_film(clips: Sequence[Clip], path: Path, columns: int) -> None:
     height, width = (side - side % 2 for side in frames[0].shape[:2])
     repeat = max(1, round(SMOOTH * interval))
     with replacing(path) as draft:
-        writer = imageio_ffmpeg.write_frames(
-            str(draft), (width, height), fps=repeat / interval, macro_block_size=2
-        )
+        writer = imageio_ffmpeg.write_frames(str(draft), (width, height), fps=repeat / interval, macro_block_size=2)
         writer.send(None)
         for frame in frames:
             for _ in range(repeat):
@@ -94,9 +92,7 @@ def animate_rollouts(clips: Sequence[Clip], path: str | Path, *, columns: int = 
     _write(frames, file, interval)
 
 
-def frames_of(
-    clips: Sequence[Clip], *, columns: int = 3, size: float = 3.6
-) -> tuple[list[NDArray[np.uint8]], float]:
+def frames_of(clips: Sequence[Clip], *, columns: int = 3, size: float = 3.6) -> tuple[list[NDArray[np.uint8]], float]:
     """The frames [H, W, 3] of :func:`animate_rollouts`, and the seconds between two of them."""
     panels = [_Panel(clip) for clip in clips]
     figure = _lay_out(panels, min(columns, len(clips)), size)
@@ -166,9 +162,7 @@ class _Panel:
         axes, segment, clip, step = self.axes, self.segment, self.clip, self.clip.start + at
         marks = draw_signals(axes, segment, step, self.view)
         plots.draw_playback(axes, segment, step, clip.others)
-        for rank, (agent, color) in enumerate(
-            zip(clip.agents, plots.colors_of(segment, clip.agents), strict=True)
-        ):
+        for rank, (agent, color) in enumerate(zip(clip.agents, plots.colors_of(segment, clip.agents), strict=True)):
             plots.draw_ways(axes, clip, rank, color, width=1.4, until=at)
             here = clip.valid[:, rank, at]
             position, heading = clip.position[here, rank, at], clip.heading[here, rank, at]
@@ -221,9 +215,7 @@ def _write(frames: Sequence[NDArray[np.uint8]], path: Path, interval: float) -> 
     # One palette for all: with their own, frames would differ, and flicker, where nothing moves.
     some = np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]])
     palette = Image.fromarray(some).quantize(COLORS, Image.Quantize.FASTOCTREE)
-    images = [
-        Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE) for pixels in frames
-    ]
+    images = [Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE) for pixels in frames]
     # The format counts in hundredths: rounded frame by frame, the error would grow.
     ends = np.rint(100 * interval * np.arange(len(images) + 1)).astype(int)
     more: dict[str, Any] = {"save_all": True, "append_images": images[1:], "loop": 0, "optimize": True}

@@ -69,9 +69,7 @@ def starting_lanes(graph: LaneGraph, position: NDArray[Any], heading: float) -> 
     }
     past = {k for k in found if found[k][1] >= graph.length[k] - 1e-6}
     gone = {k for k in past if any(s in found for s in graph.successors[k])}
-    gone |= {
-        s for k in found.keys() - past for s in graph.successors[k] if s in found and found[s][1] <= 1e-6
-    }
+    gone |= {s for k in found.keys() - past for s in graph.successors[k] if s in found and found[s][1] <= 1e-6}
     kept = sorted(found.keys() - gone, key=lambda k: (k != best, round(found[k][0], 3), k))
     return [(k, found[k][1]) for k in kept]
 

@@ -200,9 +200,7 @@ def route_line(
     line = changes[near]
     if line is None:
         return None
-    return np.concatenate(
-        [line, *(paths.followed(graph, *pair) for pair in pairwise(route.lanes[end - 1 :]))]
-    )
+    return np.concatenate([line, *(paths.followed(graph, *pair) for pair in pairwise(route.lanes[end - 1 :]))])
 
 
 def _changed(graph: LaneGraph, route: Route, start: float, speed: float) -> Reals | None:
@@ -287,9 +285,7 @@ def resampled(line: Reals, spacing: float, length: float = np.inf) -> Reals:
     return paths.at(line, arc, places if len(places) > 1 else np.array([0.0, end]))
 
 
-def route_errors(
-    lines: Sequence[Reals], path: Float[NDArray[Any], "T 2"]
-) -> Float[NDArray[np.float64], " G"]:
+def route_errors(lines: Sequence[Reals], path: Float[NDArray[Any], "T 2"]) -> Float[NDArray[np.float64], " G"]:
     """Mean distance in metres of what was driven to each of the lines [P, 2] that may be followed.
 
     Only the part of a line that can have been reached counts. Of a line that comes by a place twice only the pass

@@ -115,9 +115,7 @@ class CarFollower(TensorDictModuleBase):
         behind = (delta * _unit(own[:, 2])[:, None]).sum(-1) < -size[:, :1]
         other = torch.arange(squared.shape[1], device=m.device) != agent[:, None]
         hidden = ~now.valid[m] | ~other | behind | (squared > included.VIEW**2)
-        chosen, there = (
-            part[:, 0] for part in nearest(squared.masked_fill(hidden, torch.inf)[:, None], _LEADERS)
-        )
+        chosen, there = (part[:, 0] for part in nearest(squared.masked_fill(hidden, torch.inf)[:, None], _LEADERS))
         pose, box = now.state[m[:, None], chosen], now.size[m[:, None], chosen]
         along, aside, way = _project(line, pose[..., :2], _within(line, station - size[:, 0], included.VIEW))
         turn = pose[..., 2] - way
@@ -131,9 +129,7 @@ class CarFollower(TensorDictModuleBase):
         speed = pose[..., 3] * way.cos() + pose[..., 4] * way.sin()
         return gap, speed.gather(-1, which[:, None])[:, 0].clamp_min(0.0)
 
-    def _red(
-        self, line: _Lines, row: Tensor, at: Tensor, front: Tensor, speed: Tensor
-    ) -> Float[Tensor, " P"]:
+    def _red(self, line: _Lines, row: Tensor, at: Tensor, front: Tensor, speed: Tensor) -> Float[Tensor, " P"]:
         """Gap to the next light of the route that is red, or amber with room to stop; infinite for none."""
         scenes = self.env.scenes
         shown = scenes.light[row, at.clamp(max=scenes.light.shape[1] - 1)]

@@ -107,9 +107,7 @@ class CrowdDataset(SceneDataset):
     :class:`SceneDataset`.
     """
 
-    def __init__(
-        self, store: SegmentStore, crowd: Crowd, *given: Any, routes: bool = False, **named: Any
-    ) -> None:
+    def __init__(self, store: SegmentStore, crowd: Crowd, *given: Any, routes: bool = False, **named: Any) -> None:
         super().__init__(store, crowd.count, *given, routes=routes or crowd.along_routes, **named)
         self.crowd = crowd
 

@@ -93,9 +93,7 @@ def simulation(
     scenes, config = _ruled(agent, scenes, config, given) if agent.rule else (scenes, config)
     # Beside log playback there are planners alone: a policy whose actions nobody looks at will do.
     policy = ConstantVelocity(Bicycle()) if agent.policy is None else agent.policy
-    if agent.policy is None and int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > len(
-        egos
-    ):
+    if agent.policy is None and int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > len(egos):
         raise ConfigError("beside log playback those with a planner are the only interactive agents")
     agent.check_step(float(scenes.dt[0]))
     compiled = config.compile == "yes"
@@ -222,9 +220,7 @@ def _ruled(
     return ruled, dataclasses.replace(config, others=agent.rule or config.others)
 
 
-def _check_given(
-    agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given: Int[Tensor, "B N"] | None
-) -> None:
+def _check_given(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given: Int[Tensor, "B N"] | None) -> None:
     if given is None or agent.goals is not None or agent.rule:
         return
     follows = scenes.background & (config.others == "idm")

@@ -105,9 +105,7 @@ def _planned(
     # One that has its junction for itself is red for the time of another phase.
     phases += [np.zeros(0, np.int64)] * (len(phases) == 1)
     each = green + amber + red
-    since = (
-        _since(np.where(now[:, None], shows, False), now) if now.any() else _since(~(shows | ambers), ~now)
-    )
+    since = _since(np.where(now[:, None], shows, False), now) if now.any() else _since(~(shows | ambers), ~now)
     if not now.any():  # all red: as the last phase ends
         begin = len(phases) * each - red + min(since * dt, red)
     elif shows[now, -1].any():

@@ -44,9 +44,7 @@ class Onward:
     lights: tuple[float, ...] = ()
     seed: int = 0
 
-    def extended(
-        self, segment: RunSegment, graph: LaneGraph, steps: int, *, enter: bool = True
-    ) -> RunSegment:
+    def extended(self, segment: RunSegment, graph: LaneGraph, steps: int, *, enter: bool = True) -> RunSegment:
         """A segment of so many steps U, the first T of which are those of the log (``logged``).
 
         Past them agents that stood where they were all along still stand there, and no others are seen: they leave,
@@ -92,9 +90,7 @@ class Onward:
         size = log.size[vehicles if len(vehicles) else [log.ego]]
         size = size[(which * len(size)).astype(np.int64)]
         place, heading = _beginnings(log, graph, lanes[lane], size)
-        speed = np.array(
-            [_pace(log, graph, lanes[k], came[by == k], u) for k, u in zip(lane, pace, strict=True)]
-        )
+        speed = np.array([_pace(log, graph, lanes[k], came[by == k], u) for k, u in zip(lane, pace, strict=True)])
         count, base = len(at), log.num_agents
         fields: dict[str, Any] = {
             "agent_id": log.agent_id.max() + 1 + np.arange(count),

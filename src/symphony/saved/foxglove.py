@@ -69,9 +69,7 @@ def mcap(saved: SavedRollouts, rollout: int) -> bytes:
             cube["pose"]["orientation"] = _turned(world.heading[row, step])
             lines = [_line(_FRAME * size[row], RED, 0.3) | {"pose": cube["pose"]}] if hit[row, step] else []
             entities.append(about | {"id": str(segment.agent_id[row]), "cubes": [cube], "lines": lines})
-        names = [
-            SignalState(k).name.split("_")[-1] for k in segment.signal_state[:, saved.start + step].tolist()
-        ]
+        names = [SignalState(k).name.split("_")[-1] for k in segment.signal_state[:, saved.start + step].tolist()]
         shown = zip(segment.signal_point, names, strict=True)
         spheres = [_solid(point + MAST, np.ones(3), _LIGHTS[name]) for point, name in shown]
         entities.append(about | {"id": "lights", "spheres": spheres})

@@ -200,9 +200,7 @@ def _array(part: Tensor) -> NDArray[Any]:
     return part.detach().cpu().numpy()
 
 
-def _routes(
-    scenes: SceneBatch, row: int, goal: Tensor | None, rollouts: int
-) -> tuple[NDArray[np.int64], Polylines]:
+def _routes(scenes: SceneBatch, row: int, goal: Tensor | None, rollouts: int) -> tuple[NDArray[np.int64], Polylines]:
     """Goals [K, N] as numbers of the distinct routes that some rollout follows, and these."""
     agents = scenes.interactive.shape[1]
     chosen = np.full((rollouts, agents), -1) if goal is None else _array(goal[row])

@@ -153,8 +153,7 @@ class Previewer:
         samples |= {f"score_{name}": _finite(values.cpu()) for name, values in scores.items()}
         video = self.folder / f"rollout-{step:06d}.gif"
         clips = [
-            saved_clip(saved_rollouts(segments[b], scenes, rollouts, b), 1)
-            for b in range(min(PANELS, len(segments)))
+            saved_clip(saved_rollouts(segments[b], scenes, rollouts, b), 1) for b in range(min(PANELS, len(segments)))
         ]
         with naming(video):
             animate_rollouts(clips, video)

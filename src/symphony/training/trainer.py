@@ -202,9 +202,7 @@ class Trainer:
         replay: SearchReplay | None = None,
     ) -> None:
         if replay is not None and config.checkpoint_every % replay.period:
-            many = (
-                "" if replay.period == replay.every else f" x {replay.period // replay.every} searches as one"
-            )
+            many = "" if replay.period == replay.every else f" x {replay.period // replay.every} searches as one"
             raise ConfigError(
                 f"checkpoint-every ({config.checkpoint_every}) must be a multiple of search.updates "
                 f"({replay.every}){many}, so that a resumed run repeats no search"

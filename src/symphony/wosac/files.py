@@ -138,9 +138,7 @@ def _packed(scenarios: Path, rollouts: Path, partial: bool) -> Iterator[Packed]:
             raise DataError("more than once", file=file, segment=name, field="scenario_id")
         seen.add(name)
         if not many and len(seen) > 1:
-            message = (
-                f"is one scenario's, but there are several, {name} among them; give a folder of rollouts"
-            )
+            message = f"is one scenario's, but there are several, {name} among them; give a folder of rollouts"
             raise DataError(message, file=rollouts)
         if not many or name in unused:
             yield file, record, payload, unused.pop(name) if many else rollouts

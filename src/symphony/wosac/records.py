@@ -81,9 +81,7 @@ def logged_scenario(scenario: pb.Scenario) -> WosacScenario:
     lanes = [(f.id, f.lane) for f in scenario.map_features if f.WhichOneof("feature_data") == "lane"]
     edges = [f.road_edge for f in scenario.map_features if f.WhichOneof("feature_data") == "road_edge"]
     # A light without a stop point has it at the world's origin, as the format says.
-    seen = [
-        (step, light) for step, shown in enumerate(scenario.dynamic_map_states) for light in shown.lane_states
-    ]
+    seen = [(step, light) for step, shown in enumerate(scenario.dynamic_map_states) for light in shown.lane_states]
     stops = [(light.stop_point.x, light.stop_point.y) for _, light in seen]
     return WosacScenario(
         scenario_id=scenario.scenario_id,

@@ -76,9 +76,7 @@ def _latest(segment: RunSegment) -> NDArray[np.uint8]:
     return seen[np.arange(len(seen)), (seen != SignalState.UNKNOWN).argmax(1)]
 
 
-def walks(
-    segment: RunSegment, rows: NDArray[np.int64], rollouts: int, steps: int, seed: int
-) -> NDArray[np.float64]:
+def walks(segment: RunSegment, rows: NDArray[np.int64], rollouts: int, steps: int, seed: int) -> NDArray[np.float64]:
     """[R, n, F, 3] x, y, heading of pedestrians and whoever else is driven by nobody.
 
     They keep their velocity, each rollout with a pace and a course of its own, and their headings change as they did

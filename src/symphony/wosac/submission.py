@@ -161,9 +161,7 @@ def scenario_message(scenario_id: str, rollouts: SimulatedRollouts) -> pb.Scenar
     for rollout in range(ROLLOUTS):
         scene = message.joint_scenes.add()
         for agent, object_id in enumerate(ids.tolist()):
-            states = {
-                field: getattr(rollouts, name)[rollout, agent].tolist() for name, field in FIELDS.items()
-            }
+            states = {field: getattr(rollouts, name)[rollout, agent].tolist() for name, field in FIELDS.items()}
             scene.simulated_trajectories.add(object_id=object_id, **states)
     return message
 
@@ -282,9 +280,7 @@ def _names_problem(names: list[str]) -> list[str]:
     return [f"shards {', '.join(map(str, there))} of {total}, expected each once"] * wrong
 
 
-def _check_scenario(
-    scenario: pb.ScenarioRollouts, seen: set[str], required: Mapping[str, list[int]] | None
-) -> None:
+def _check_scenario(scenario: pb.ScenarioRollouts, seen: set[str], required: Mapping[str, list[int]] | None) -> None:
     name: str | bytes = scenario.scenario_id
     if not name or isinstance(name, bytes):
         raise DataError("missing, or not UTF-8", field="scenario_id")

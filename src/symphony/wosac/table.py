@@ -35,9 +35,7 @@ _WORDS = {
 def wosac_table(record: dict[str, Any]) -> str:
     """A table in Markdown: the baselines of a record that has them, its agent, and what the table is of."""
     name, found = record["agent"], record["agents"]
-    rows = [
-        (_WORDS[other], numbers) for other, numbers in found.items() if other in _WORDS and len(found) > 1
-    ]
+    rows = [(_WORDS[other], numbers) for other, numbers in found.items() if other in _WORDS and len(found) > 1]
     rows.append((f"{name}, {how_in_words(record['how'])}", found[name]))
     lines = [["", *(column.title for column in COLUMNS), "order kept %"], ["---"] * (len(COLUMNS) + 2)]
     for row, numbers in rows:

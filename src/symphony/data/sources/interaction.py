@@ -201,9 +201,7 @@ def _observed(rows: Rows, begin: int, stop: int) -> tuple[int, int]:
     for track in np.unique(rows.track[rows.kind == AgentType.VEHICLE]):
         mine = np.flatnonzero(rows.track == track)
         for part in np.split(mine, np.flatnonzero(np.diff(step[mine]) != 1) + 1):
-            moves = (
-                np.linalg.norm(rows.state[part, :2] - rows.state[part[0], :2], axis=-1).max() > base.MOVING
-            )
+            moves = np.linalg.norm(rows.state[part, :2] - rows.state[part[0], :2], axis=-1).max() > base.MOVING
             best = times[step[part]] if moves and len(part) > len(best) else best
     whole = not len(best) or 2 * (best[-1] - best[0]) < stop - begin - 1
     return (begin, stop) if whole else (int(best[0]), int(best[-1]) + 1)

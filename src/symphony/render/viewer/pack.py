@@ -122,9 +122,7 @@ class Replay(NamedTuple):
 
     saved: SavedRollouts
     events: Sequence[Event] = ()
-    collision_in: NDArray[Any] | None = (
-        None  # [K, T, N] seconds after each step, not finite where there is none
-    )
+    collision_in: NDArray[Any] | None = None  # [K, T, N] seconds after each step, not finite where there is none
 
 
 class _Packer:

@@ -135,9 +135,7 @@ def _features(tracks: _Tracks, scenario: WosacScenario) -> dict[str, Tensor]:
     street = (scenario.lane_type == SURFACE_STREET).nonzero()[0].tolist()
     lanes = Lanes.of([scenario.lanes[k] for k in street], scenario.lane_id[street])
     seen = scenario.signal_step, scenario.signal_lane, scenario.signal_state, scenario.signal_point
-    violations = red_light_violations(
-        position[scored], valid[scored], lanes, Signals.of(*seen, valid.shape[-1])
-    )
+    violations = red_light_violations(position[scored], valid[scored], lanes, Signals.of(*seen, valid.shape[-1]))
     away = sum((axis - axis[:1]).square() for axis in (x, y, z)).sqrt()  # type: ignore[union-attr]
     known = valid[0, :count]
     return {

@@ -44,9 +44,7 @@ class Lanes:
         whole = [line if len(line) == longest else np.concatenate([line, origin]) for line, _ in pairs]
         start = torch.from_numpy(np.concatenate([origin[:0], *(line[:-1] for line in whole)]))
         along = torch.from_numpy(np.concatenate([origin[:0], *(np.diff(line, axis=0) for line in whole)]))
-        lane = torch.tensor(
-            [int(name) for line, (_, name) in zip(whole, pairs, strict=True) for _ in line[1:]]
-        )
+        lane = torch.tensor([int(name) for line, (_, name) in zip(whole, pairs, strict=True) for _ in line[1:]])
         return cls(start, along, along[:, 0] * along[:, 0] + along[:, 1] * along[:, 1], lane)
 
     def __getitem__(self, rows: Tensor) -> Lanes:

@@ -201,8 +201,6 @@ def _ever(features: WosacFeatures, flag: str, *, vehicles: bool = False) -> tupl
     """Whether a flag is set at any step at which the log is valid, [E] of the log and [R, E] of the rollouts; of
     vehicles alone, if asked for.
     """
-    log, simulated = (
-        (source[flag] & features.log_valid).any(-1) for source in (features.log, features.simulated)
-    )
+    log, simulated = ((source[flag] & features.log_valid).any(-1) for source in (features.log, features.simulated))
     kind = (features.object_type == VEHICLE) | (not vehicles)
     return log & kind, simulated & kind
