@@ -20,8 +20,8 @@ from symphony.envs import DrivingEnv, collate, scene
 from symphony.learning.demonstrations import SceneDataset
 from symphony.roadgraph import LaneGraph
 
-BY_THE_CALLER = {keys.SIMULATED, keys.ROLLOUT, keys.NOISE_PLAN}
-"""What depends on how batches are put together; the first two must be there, the last is optional."""
+BY_THE_CALLER = {keys.SIMULATED, keys.ROLLOUT, keys.NOISE_PLAN, keys.WEIGHT}
+"""What depends on how batches are put together; the first two must be there, the others are optional."""
 SEGMENTS = straight_road(3, seed=0, steps=8), crossing(2, seed=0, steps=8)
 SPACES = pytest.mark.parametrize("space", ["bicycle", "displacement"])
 
