@@ -164,7 +164,7 @@ def test_networks_in_vain_come_to_an_end(tmp_path: Path, monkeypatch: pytest.Mon
 @needs_sumo
 def test_a_killed_run_is_continued(tmp_path: Path) -> None:
     out = tmp_path / "killed"
-    what = f"data generate --count 6 --seed 11 --out {out}".split()
+    what = f"data generate --count 12 --seed 11 --out {out}".split()
     command = [sys.executable, "-m", "symphony", *what]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
@@ -175,11 +175,11 @@ def test_a_killed_run_is_continued(tmp_path: Path) -> None:
         process.kill()
         process.wait()
     some = len(SegmentStore(out))
-    assert 0 < some < 6
+    assert 0 < some < 12
     if os.name == "posix":
         assert process.returncode == -signal.SIGKILL
     assert main([*what, "--workers", "2", "--json", str(tmp_path / "killed.json")]) == 0
-    state = generate(Plan(6, seed=11), tmp_path / "whole")
+    state = generate(Plan(12, seed=11), tmp_path / "whole")
     store, whole = SegmentStore(out), SegmentStore(tmp_path / "whole")
     assert store.checksum() == whole.checksum()
     assert store.ids == whole.ids
