@@ -10,9 +10,9 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 
 from helpers_segments import straight_road
 from helpers_store import brief, fill
@@ -78,7 +78,7 @@ def test_rates_of_independent_runs_are_binomial(hits: list[bool], confidence: fl
     assert None not in (found.low, found.mean, found.high)
     assert found.low <= found.mean <= found.high
     n, k = len(hits), sum(hits)
-    low, high = stats.binomtest(k, n).proportion_ci(2 * confidence - 1)
+    low, high = scipy.stats.binomtest(k, n).proportion_ci(2 * confidence - 1)
     assert found.low <= 100 * low + 1e-9
     assert found.high >= 100 * high - 1e-9
     if k in (0, n):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import pytest
+import scipy
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 from tensordict import TensorDict
 
 from symphony.config import AgentConfig, AgentSpec
@@ -164,12 +164,12 @@ def test_draws_are_those_of_the_gaussian(how):
     for k in range(2):
         u = dist.latent(drawn)[:, k]
         standard = (u - dist.loc[k]) / dist.scale[k]
-        assert stats.kstest(standard.detach().numpy(), "norm").pvalue > 1e-3
+        assert scipy.stats.kstest(standard.detach().numpy(), "norm").pvalue > 1e-3
         assert (u < dist.loc[k]).double().mean() == pytest.approx(0.5, abs=0.02)
     ends = torch.tensor([[2.0**-24, 1 - 2.0**-24]])
     assert make(dtype=torch.float32).icdf(ends).isfinite().all()
     across = drawn[:, 1] / drawn[:, 0]
-    assert abs(stats.spearmanr(drawn[:, 0].numpy(), across.numpy()).statistic) < 0.03
+    assert abs(scipy.stats.spearmanr(drawn[:, 0].numpy(), across.numpy()).statistic) < 0.03
 
 
 numbers = st.floats(-1e6, 1e6, width=32)
