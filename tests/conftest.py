@@ -19,7 +19,7 @@ from helpers_processes import serve_from_here
 from helpers_skips import LIMITS, by_kind, grown
 from symphony import parallel as engine
 
-# Looking for garbage is a twentieth of all work otherwise, and there is next to none while tests are imported.
+# There is next to no garbage while tests are imported; to look for it would be a fifth of that work.
 gc.disable()
 
 # A busy machine must not fail a test; other examples are tried each time.
@@ -41,7 +41,6 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 def pytest_collection_finish() -> None:
     """Nothing that was imported or collected is garbage: it is not to be looked at again and again."""
     gc.freeze()
-    gc.set_threshold(20_000, 10, 10)
     gc.enable()
     serve_from_here()
 

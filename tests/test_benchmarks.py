@@ -104,7 +104,8 @@ def test_reinforcement_learning_is_recorded(program: Any, tmp_path: Path, monkey
     learning = program("reinforcement")
     store = fill(tmp_path / "store", [straight_road(4, steps=14), crossing(4, steps=14)]).path
     monkeypatch.setattr(learning, "builtin_store", lambda split: store)
-    monkeypatch.setattr(learning, "SHOWN", (0,))
+    for name, value in (("SHOWN", (0,)), ("STEPS", 4)):
+        monkeypatch.setattr(learning, name, value)
     runs = {method: [learning.run(method, seed, batches=1) for seed in (0, 1)] for method in learning.METHODS}
     for one, other in runs.values():
         driven, crashes = zip(*one["batches"], one["unseen"], strict=True)

@@ -53,8 +53,7 @@ def elements(seen: Any, group: str) -> Tensor:
     return joined.gather(-2, order[..., None].expand(joined.shape))
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("counts", [(3, 60, 2), (16, 4000, 30)])
+@pytest.mark.parametrize(("counts", "seed"), [((3, 60, 2), 0), ((3, 60, 2), 1), ((16, 4000, 30), 0)])
 @torch.no_grad()
 def test_a_device_sees_and_flags_the_same(counts, seed, monkeypatch):
     segments = [crossing(6, seed=seed), straight_road(5, seed=seed), ring()]

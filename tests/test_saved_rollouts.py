@@ -242,7 +242,7 @@ def read_back(saved, rollout, path):
 def test_a_rollout_comes_back_from_commonroad(tmp_path):
     """Every agent is where it was in the rollout, at every step, within a millimetre."""
     for saved in searched()[1]:
-        for rollout in (0, saved.rollouts - 1):
+        for rollout in (saved.rollouts - 1,):
             found, world = read_back(saved, rollout, tmp_path), world_of(saved, rollout)
             assert (found.dt, found.num_steps) == (saved.segment.dt, saved.steps + 1)
             for row in np.flatnonzero(world.valid.any(1)):

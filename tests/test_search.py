@@ -140,7 +140,7 @@ def test_no_rollout_depends_on_batch_or_order(dataset, kind, how, goals):
     whole, mixed = driven(agent, scenes, kind, **how), driven(agent, dataset.scenes(order), kind, **how)
     again = driven(agent, scenes, kind, **how | {"seed": 4})
     assert not torch.equal(again.rollouts.state, whole.rollouts.state)
-    for item in range(4):
+    for item in (0, 3):
         alone = driven(agent, dataset.scenes([item]), kind, **how)
         steps = alone.rollouts.counted.shape[2]
         for name in Rollouts._fields:

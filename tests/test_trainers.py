@@ -108,7 +108,7 @@ def test_a_recipe_of_ones_own_may_leave_the_policy_as_it_is(store: Path, tmp_pat
 
 
 def test_training_lowers_the_loss(store: Path, tmp_path: Path) -> None:
-    how = {"steps": 60, "states": 128, "learning_rate": 1e-2, "checkpoint_every": 60}
+    how = {"steps": 40, "states": 128, "learning_rate": 1e-2, "checkpoint_every": 40}
     out = train(config(store, tmp_path / "long", **how))
     losses, rates = ([r[name] for r in read_metrics(out)] for name in ("loss_policy", "learning_rate"))
     assert rates[0] == 1e-2
