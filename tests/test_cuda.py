@@ -127,7 +127,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("method", ["bc_ts_h", "mgail_ts_h"])
+@pytest.mark.parametrize("method", ["bc_ts_h", "bc_rl_h", "mgail_ts_h"])
 def test_training_and_evaluation_are_repeated_and_resumed_to_the_bit(method, store, tmp_path):
     def trained(name: str, resume: bool = False) -> Path:
         mgail = MGAILConfig(regression=0, head_start=0, rollouts=4)

@@ -440,6 +440,18 @@ def test_lanes_lie_where_opendrive_has_them(tmp_path: Path) -> None:
     assert generate(Plan(1, kinds=(str(file),)), tmp_path / "store").complete
 
 
+@needs_sumo
+@pytest.mark.parametrize("limit", ['max="no limit"', 'max="undefined"', 'max="30" unit="mph"'])
+def test_a_straight_road_is_seen_from_its_middle_whatever_its_limit_says(tmp_path: Path, limit: str) -> None:
+    lanes = f'<center><lane id="0" type="none"/></center><right>{LANE.format(-1, 3, "")}</right>'
+    text = XODR.format(pieces='<geometry s="0" x="0" y="0" hdg="0" length="250"><line/></geometry>', lanes=lanes)
+    file = tmp_path / "straight.xodr"
+    file.write_text(text.replace('max="30" unit="mph"', limit))
+    network = read_network(own_network(file, tmp_path))
+    ends = np.concatenate([line[[0, -1]] for line in network.lanes])
+    assert np.linalg.norm(np.array(network.centers)[:, None] - ends, axis=-1).min() > 50
+
+
 OSM = """<osm version="0.6">
 {nodes}
 <way id="1">{west}<tag k="highway" v="residential"/></way>

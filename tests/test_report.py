@@ -119,6 +119,11 @@ def test_progress_is_along_the_route_and_relative_to_the_log(lines: list[Any]) -
         row = rows(dataclasses.replace(ways, segment=segment.replace(valid=valid)))[0]
         assert row["progress"] == pytest.approx(20 if valid[0, 0] else 18, abs=1e-4)
         assert row["progress_ratio"] == pytest.approx(1)
+    # Who was gone and came back to where it had begun has driven both stretches, and is compared with the log up to then.
+    ways.counted[0, 4, 0] = False
+    ways.state[0, 6:, 0, :2] = ways.state[0, :5, 0, :2]
+    row = rows(ways)[0]
+    assert (row["progress"], row["progress_ratio"]) == pytest.approx((16, 0.4), abs=1e-4)
 
 
 def red(states: Any = SignalState.STOP, others: Any = SignalState.GO) -> list[tuple[int, int]]:

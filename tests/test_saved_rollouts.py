@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -107,6 +108,11 @@ def test_another_simulation_or_folder_is_refused(tmp_path):
     (tmp_path / "other" / "thesis.txt").write_text("mine")
     with pytest.raises(DataError, match=r"another simulation, which differs in settings\.rollouts"):
         RolloutWriter(tmp_path / "sim", dataclasses.replace(ABOUT, settings={"rollouts": 3}))
+    # What an older folder says nothing of was as it is by default now.
+    for lights in ([], [20.0, 3.0, 2.0]):
+        more = dataclasses.replace(ABOUT, settings={**ABOUT.settings, "lights": lights, "after_collision": "go-on"})
+        with pytest.raises(DataError, match=r"settings\.lights$") if lights else contextlib.nullcontext():
+            RolloutWriter(tmp_path / "sim", more).close()
     with pytest.raises(DataError, match="refusing"):
         RolloutWriter(tmp_path / "other", ABOUT)
     (tmp_path / "shop").mkdir()

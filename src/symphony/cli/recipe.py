@@ -32,6 +32,7 @@ def main(recipe: Any, description: str | None, args: Sequence[str] | None = None
     settings = tyro.cli(Arguments, description=description, args=expanded([recipe.__name__, *args]))
     symphony.SegmentStore(settings.test)  # complains now, not after the training
     folder, training = train(settings.config, recipe), settings.config
-    config = symphony.EvaluateConfig(rollouts=settings.rollouts, seed=training.seed, device=training.device)
+    how: Any = {"seed": training.seed, "device": training.device, "compile": training.compile}
+    config = symphony.EvaluateConfig(rollouts=settings.rollouts, **how)
     # What its folder names is the user's own words of a moment ago.
     Evaluate(agent=str(folder), data=settings.test, trust_code=True, config=config)()

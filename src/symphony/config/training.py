@@ -159,7 +159,8 @@ class TrainConfig(RunConfig):
     @property
     def scenes(self) -> dict[str, Any]:
         """Which run segments are learned from and how they are drawn, as :class:`SceneDataset` takes it."""
-        few_shapes = compiles(self.compile, self.device, self.steps // self.search.updates)
+        together = self.rows(1 << 30) // self.segments
+        few_shapes = compiles(self.compile, self.device, self.steps // (self.search.updates * together))
         how = {"interactive": self.agent.interactive, "duration": self.duration}
         return how | {"few_shapes": few_shapes}
 

@@ -251,7 +251,8 @@ def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> tuple[Re
     log = saved.segment.position[rows, within, :2].astype(np.float64)
     seen = saved.logged(rows)
     goal = saved.goal[:, evaluated]
-    both = there & seen
+    left = (~there & (there.cumsum(-1) > 0)).cumsum(-1) > 0  # who comes back is elsewhere, on purpose
+    both = there & seen & ~left
     driven, compared = _length(path, there), _length(path, both)
     logged = np.broadcast_to(_length(log, seen), goal.shape).copy()
     has = np.append(np.diff(saved.routes.offsets) > 1, False)[goal]
@@ -266,7 +267,9 @@ def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> tuple[Re
     most = max(map(len, whole))
     lines = np.stack([np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in whole])
     places = stations_along(lines[which], path[has], there[has])
-    driven[has], compared[has] = _advance(places, there[has]), _advance(places, both[has])
+    # Stretch by stretch, for one that came back to where it had begun.
+    stays = there[has][:, 1:] & there[has][:, :-1]
+    driven[has], compared[has] = np.where(stays, np.diff(places, axis=1), 0.0).sum(1), _advance(places, both[has])
     logged[has] = _advance(stations_along(lines, log[who], seen[who]), seen[who])[which]
     # Whoever is farther from the end than a vehicle is long has gone on from it.
     past = np.linalg.norm(path[has] - lines[which][:, -1:], axis=-1) > PAST_END

@@ -201,7 +201,7 @@ class SceneDataset:
         steps = round(self.duration / segment.dt) + 1
         if segment.num_steps < steps:
             why = f"has {(segment.num_steps - 1) * segment.dt:g} s, {self.duration:g} are asked for"
-            why += "; past the log goes open traffic that is simulated (`simulate --interactive all`), not evaluated"
+            why += "; only open traffic that is simulated, not evaluated or learned from, goes on past the log"
             raise DataError(why, file=self.store.path, segment=segment.segment_id)
         timed = ("position", "heading", "velocity", "valid", "signal_state")
         return segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})

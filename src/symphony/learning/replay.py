@@ -130,13 +130,13 @@ class SearchReplay:
             TensorDict [K, N]: observation, ``ACTION``, ``ROLLOUT`` (True), ``WEIGHT`` (see :func:`advantages`).
         """
         found = advantages(self.env, self.leaves)
-        share = found.abs().amax(-1)
-        pick = torch.multinomial(share.flatten().clamp_min(1e-9), count, replacement=True, generator=rng)
+        share = found.abs().amax(-1).flatten().clamp_min(1e-9)
+        pick = torch.multinomial(share.cpu(), count, replacement=True, generator=rng).to(share.device)
         chosen = self.leaves.flatten()[pick]
         batch = DrivingEnv(self.env.scenes, self.env.dynamics, observation).at(chosen)
         batch.set(keys.ACTION, chosen.get(keys.ACTION))
         # Divided by how likely each was drawn: the mean is that over all states.
-        weight = found.flatten(0, -2)[pick] * (share.mean() / share.flatten()[pick].clamp_min(1e-9))[:, None]
+        weight = found.flatten(0, -2)[pick] * (share.mean() / share[pick])[:, None]
         batch.set(keys.ROLLOUT, torch.ones_like(batch.get(keys.VALID)))
         return batch.set(keys.WEIGHT, PRICE * weight)
 

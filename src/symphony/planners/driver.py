@@ -225,7 +225,7 @@ class _Asked(_Driver):
         self._last = env.scenes.last_step.cpu().numpy()
         self._held: dict[int, Planner | Failure] = {}
         self._meant: dict[int, dict[int, NDArray[np.float32]]] = {}
-        self._past: dict[int, Moments] = {}
+        self._past: dict[int, tuple[int, Moments]] = {}  # and the step after which the last of them was seen
         scene = start.get(keys.SCENE).flatten().tolist()
         state = start.get(keys.STATE)[..., place, :].reshape(-1, 4).cpu().numpy()
         own = fold_in(fold_in(start.get(keys.STREAM), Stream.PLANNERS), seed)
@@ -241,7 +241,7 @@ class _Asked(_Driver):
             error = error or answer(planner.reset, made, seconds=egos.seconds)
             failed = isinstance(error, Exception)
             self._held[number] = self._failure(row, 0, "reset", error) if failed else planner
-            self._meant[number], self._past[number] = {}, ()
+            self._meant[number], self._past[number] = {}, (-1, ())
         self._next = len(scene)
         drives = next((held for held in self._held.values() if not isinstance(held, Failure)), None)
         if forked and drives is not None:
@@ -280,11 +280,12 @@ class _Asked(_Driver):
             planner = self._held[numbers[m]]
             if going[m] and not isinstance(planner, Failure):
                 ahead = route_from(self._routes[row], come[m])
-                past = self._past[numbers[m]]
+                seen_at, past = self._past[numbers[m]]
+                past = past if seen_at == steps[m] - 1 else ()  # one that was gone begins anew
                 now = moves[m], present[m]
                 at = self.egos.segments[row], self.rows[row], steps[m], own[m].numpy()
                 seen = traffic_of(*at, now, past, ahead)
-                self._past[numbers[m]] = (*past, now)[-round(HISTORY / self.env.dt) :]
+                self._past[numbers[m]] = steps[m], (*past, now)[-round(HISTORY / self.env.dt) :]
                 asked.append((m, planner, seen))
         plans = plans_of([one[1] for one in asked], [one[2] for one in asked], self.egos.seconds)
         # One that is over, or has failed, keeps its speed.

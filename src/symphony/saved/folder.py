@@ -43,6 +43,7 @@ _TREE_SHAPES = {"state": "fRSTN4", "score": "fRSTN", "totals": "fRPS", "parents"
 _TREE_SHAPES |= dict.fromkeys(("there", "collision", "offroad"), "bRSTN")
 
 FORMAT = 1
+_LATER = {"lights": [], "after_collision": "go-on"}  # what settings mean that older folders lack
 MANIFEST, INDEX, SEGMENTS, LOCK = "manifest.json", "index.jsonl", "segments", "rollouts.lock"
 _KINDS = {"agent": str, "seed": int, "drivers": dict, "settings": dict, "store": dict}
 
@@ -111,7 +112,7 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
             held = _read_manifest(self.path)
             changed = [name for name in manifest if manifest[name] != held.get(name)]
             if "settings" in changed and isinstance(held.get("settings"), dict):
-                now, before = manifest["settings"], held["settings"]
+                now, before = manifest["settings"], _LATER | held["settings"]
                 changed.remove("settings")
                 changed += [f"settings.{n}" for n in {**now, **before} if now.get(n) != before.get(n)]
             # One that holds nothing yet is nobody's.
@@ -336,7 +337,10 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
     drivers = tuple(facts["drivers"])
     failed = {int(number): str(reason) for number, reason in facts["failed"].items()}
     held = {"segment": segment, "start": facts["start"], "drivers": drivers, "failed": failed, "trees": trees}
-    return built(SavedRollouts, "", **held, plan=arrays.get("plan"))
+    plan = arrays.get("plan")
+    if plan is not None and plan.ndim == 4:  # of the ego alone, as plans were kept once
+        plan = plan[:, None]
+    return built(SavedRollouts, "", **held, plan=plan)
 
 
 def _check(saved: SavedRollouts, segment_id: str) -> None:

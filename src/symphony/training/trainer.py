@@ -390,6 +390,7 @@ class Trainer:
             "skips": dataclasses.asdict(self.skips),
             "processes": self.world.count,
             "data": self.checksum,
+            "period": 0 if self.replay is None else self.replay.period,
         }
         what: Any = {"modules": self.agent.modules, "optimizers": self.optimizers, "extra": extra}
         save_checkpoint(self.config.out / "checkpoints", step=step, **what)
@@ -404,6 +405,10 @@ class Trainer:
         out, count = self.config.out, self.world.count
         if before != count:
             raise ConfigError(f"{out}: trained by {before} processes so far, can't be resumed by {count}")
+        period = 0 if self.replay is None else self.replay.period
+        if (searched := extra.get("period", period)) != period:
+            what = f"{out}: searched for {searched} updates at a time so far, now it would for {period}"
+            raise ConfigError(f"{what}: device and checkpoint-every decide that")
         then = str(extra.get("data", self.checksum))
         if then != self.checksum:
             why = f"not the run segments that {out} learned from so far"

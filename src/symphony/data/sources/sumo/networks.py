@@ -395,7 +395,8 @@ def _limited(root: ET.Element) -> ET.ElementTree[ET.Element]:
             begin = number(section.get("s"), "laneSection")
             limit = next((speed for at, speed in reversed(limits) if at <= begin), None)
             for lane in section.iterfind("*/lane"):
-                if limit is not None and lane.find("speed") is None:
+                # A road may have a limit that is no number, "no limit" or "undefined"; a lane may not.
+                if limit is not None and limit.get("max", "")[:1].isdigit() and lane.find("speed") is None:
                     lane.append(ET.Element("speed", limit.attrib, sOffset="0"))
     return ET.ElementTree(root)
 

@@ -130,7 +130,8 @@ def read_network(file: Path) -> Network:
         if crossing or balance[junction.attrib["id"]] != 0:
             centers.append(outline.mean(0))
     # Roads without a junction are seen from their middles.
-    centers = centers or [line[len(line) // 2] for line, inner in zip(lanes, internal, strict=True) if not inner]
+    middles = (densify(line, _LANE_SPACING) for line, inner in zip(lanes, internal, strict=True) if not inner)
+    centers = centers or [line[len(line) // 2] for line in middles]
     return Network(
         lanes,
         np.array(width),
