@@ -119,7 +119,7 @@ def test_progress_is_along_the_route_and_relative_to_the_log(lines: list[Any]) -
         row = rows(dataclasses.replace(ways, segment=segment.replace(valid=valid)))[0]
         assert row["progress"] == pytest.approx(20 if valid[0, 0] else 18, abs=1e-4)
         assert row["progress_ratio"] == pytest.approx(1)
-    # Who was gone and came back to where it had begun has driven both stretches, and is compared with the log up to then.
+    # Who was gone and came back to where it had begun drove both stretches, and is compared with the log up to then.
     ways.counted[0, 4, 0] = False
     ways.state[0, 6:, 0, :2] = ways.state[0, :5, 0, :2]
     row = rows(ways)[0]
