@@ -111,11 +111,13 @@ class SearchReplay:
         Returns:
             TensorDict [K, N]: observation, ``ACTION``, ``ROLLOUT`` (True).
         """
-        chosen = _drawn(self.env, self.leaves, count, rng)
+        return self._learned(_drawn(self.env, self.leaves, count, rng), observation)
+
+    def _learned(self, chosen: TensorDictBase, observation: ObservationConfig) -> TensorDict:
+        """Steps [K] as a policy observes them, with what was done."""
         batch = DrivingEnv(self.env.scenes, self.env.dynamics, observation).at(chosen)
-        valid = batch.get(keys.VALID)
         batch.set(keys.ACTION, chosen.get(keys.ACTION))
-        return batch.set(keys.ROLLOUT, torch.ones_like(valid))
+        return batch.set(keys.ROLLOUT, torch.ones_like(batch.get(keys.VALID)))
 
     def blamed(self, count: int, rng: torch.Generator, observation: ObservationConfig) -> TensorDict:
         """States of rollouts and what was done in them, drawn as often as it matters, with weights for a policy
@@ -132,13 +134,9 @@ class SearchReplay:
         found = advantages(self.env, self.leaves)
         share = found.abs().amax(-1).flatten().clamp_min(1e-9)
         pick = torch.multinomial(share.cpu(), count, replacement=True, generator=rng).to(share.device)
-        chosen = self.leaves.flatten()[pick]
-        batch = DrivingEnv(self.env.scenes, self.env.dynamics, observation).at(chosen)
-        batch.set(keys.ACTION, chosen.get(keys.ACTION))
         # Divided by how likely each was drawn: the mean is that over all states.
         weight = found.flatten(0, -2)[pick] * (share.mean() / share[pick])[:, None]
-        batch.set(keys.ROLLOUT, torch.ones_like(batch.get(keys.VALID)))
-        return batch.set(keys.WEIGHT, PRICE * weight)
+        return self._learned(self.leaves.flatten()[pick], observation).set(keys.WEIGHT, PRICE * weight)
 
     def both_kinds(self, rng: torch.Generator) -> TensorDict:
         """Simulated states, pruned ones included, and logged states of the same scenes.
