@@ -1,6 +1,7 @@
 """Behavioural cloning with goals, and a policy gradient against collisions in closed loop: no row of the paper's.
 
-Made for an agent that drives already (`--warm-start`), with rollouts of eight branches that nothing prunes.
+Made for an agent that drives already (`--warm-start`). Nothing prunes its rollouts; the included agent had eight of
+each run segment (`--search.branches 8`).
 """
 
 from __future__ import annotations

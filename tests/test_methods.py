@@ -252,6 +252,8 @@ def test_what_is_searched_is_what_is_imitated(store: Path, tmp_path: Path) -> No
 
 def test_blame_is_what_came_of_an_action_beyond_the_mean_of_the_other_branches(store, tmp_path):
     search = SearchConfig(branches=4, prune_every=4, updates=2, states=8, rule="replace", goals="branch")
+    with pytest.raises(ConfigError, match=r"search\.branches must be at least 2"):
+        build(tiny("bc_rl_h", store, tmp_path, search=replace(search, branches=1)))._update(0)
     trainer = build(tiny("bc_rl_h", store, tmp_path, segments=3, search=search))
     trainer._update(0)
     replay = pieces(trainer)["replay"]

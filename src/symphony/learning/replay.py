@@ -205,8 +205,10 @@ def with_survivors(experts: TensorDict, rollouts: TensorDict) -> TensorDict:
 
 def advantages(env: DrivingEnv, rollouts: TensorDictBase) -> Float[Tensor, "B S T N"]:
     """How much better than in the other branches it went on after each action: less a first collision and time off
-    the road, discounted; 0 after the collision, and where nobody is.
+    the road, discounted; 0 after the collision, and where nobody is. Raises a :class:`ConfigError` for one branch.
     """
+    if rollouts.shape[1] < 2:
+        raise ConfigError("search.branches must be at least 2: an action is compared with those of other branches")
     scene, step = rollouts.get(keys.SCENE).squeeze(-1), rollouts.get(keys.STEP).squeeze(-1)
     there = rollouts.get(keys.VALID) & (step < env.scenes.last_step[scene])[..., None]
     hit, off = (rollouts.get(("next", *key)).squeeze(-1) & there for key in (keys.COLLISION, keys.OFFROAD))
