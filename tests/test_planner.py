@@ -313,6 +313,10 @@ def test_runs_are_spread_over_as_many_segments_as_there_are(runs, segments, sear
     agent = small()
     config = EvaluateConfig(search=search, trees=trees, rule="systematic", branches=16)
     count, how = spread_runs(agent, config, runs, segments)
+    least, some = spread_runs(agent, config, runs, segments, planned=True)
+    # As few trees as can be, as many in each segment.
+    assert least * some.trees < -(-runs // 16) + some.trees if search == "tree" else (least, some) == (count, how)
+    assert runs <= least * some.rollouts
     plan = agent.plan(how)  # refuses what can't be simulated
     assert 1 <= count <= segments
     assert plan.trees * plan.taken == how.rollouts
@@ -342,9 +346,33 @@ def test_a_hundred_runs_are_a_hundred_and_beside_the_log_the_ego_is_alone(store,
 
 
 def test_beside_a_planner_nothing_is_searched_unless_asked_for() -> None:
-    """A search asks the planner once for each branch."""
-    for changes, search in (({}, "none"), ({"search": "tree"}, "tree"), ({"branches": 3}, "tree")):
-        assert beside_planner(EvaluateConfig(rollouts=2, **changes)).search == search  # type: ignore[arg-type]
+    """A search asks the planner once for each branch: by default there are few, and all count where they can."""
+    for changes, *how in (
+        ({}, "none", 1, 0), ({"branches": 3, "rollouts": 2}, "tree", 1, 3), ({"search": "tree"}, "tree", 4, 4),
+        ({"search": "tree", "rollouts": 1}, "tree", 1, 4), ({"search": "tree", "rollouts": 7}, "tree", 1, 7),
+        ({"trees": 2}, "tree", 2, 8), ({"trees": 16}, "tree", 16, 4),
+    ):  # fmt: skip
+        found = beside_planner(EvaluateConfig(**changes))  # type: ignore[arg-type]
+        assert [found.search, found.trees, found.branches] == how, changes
+        assert beside_planner(found) == found
+
+
+CALLS: list[str] = []
+
+
+def noted(seen: Observation) -> tuple[float, float]:
+    CALLS.append(seen.segment_id)
+    return 0.0, 0.0
+
+
+def test_a_planner_is_asked_in_no_more_trees_than_the_runs_are_leaves_of(tmp_path: Path) -> None:
+    fill(tmp_path / "store", [straight_road(4, steps=3, segment_id=f"road-{i}") for i in range(5)])
+    words = f"simulate {AGENT} --search tree --planner {__name__}:noted --data {tmp_path}/store --runs".split()
+    for runs, segments in ((4, 1), (16, 4), (64, 4)):
+        CALLS.clear()
+        assert main([*words, str(runs), "--out", str(tmp_path / str(runs))]) == 0
+        assert (len(CALLS), len(set(CALLS))) == (2 * runs, segments)  # one of each step of each run
+        assert sum(entry.rollouts for entry in load_rollouts(tmp_path / str(runs)).entries) == runs
 
 
 @pytest.mark.parametrize(("name", "why"), [

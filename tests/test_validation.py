@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from torch import nn
 
 from helpers_runs import build, same_weights, tiny, weights
@@ -23,7 +24,7 @@ from symphony.config import EvaluateConfig, TrainConfig, ValidationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
 from symphony.recipes import train
-from symphony.training.hooks import METRICS
+from symphony.training.hooks import METRICS, Validator
 from symphony.training.logging import read_metrics
 
 
@@ -64,6 +65,17 @@ def test_every_checkpoint_and_the_last_weights_are_evaluated_as_the_evaluator_do
         assert found.search == "tree"
         numbers = found.numbers()
         assert {f"validation_{name}": numbers[name] for name in METRICS}.items() <= record.items()
+
+
+def test_validations_are_compiled_as_the_run_says(store, held_out, tmp_path):
+    """By itself on a device where all together are long enough to win, each of which may be too short."""
+    for choice, device, length, compiled in (
+        ("yes", "cpu", 4, True), ("no", "meta", 4000, False), ("auto", "cpu", 4000, False),
+        ("auto", "meta", 4, False), ("auto", "meta", 4000, True),
+    ):  # fmt: skip
+        run = config(store, tmp_path, held_out, compile=choice, device=device, steps=length)
+        found = Validator(run, load_agent("idm"), torch.device(device))
+        assert (found.how.compile, found.dataset.few_shapes) == ("yes" if compiled else "no", compiled)
 
 
 Scripted = Callable[..., None]

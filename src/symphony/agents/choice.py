@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from symphony.agents.checkpoint import MANIFEST, CheckpointError, checkpoints, load_checkpoint
 from symphony.errors import ConfigError, DataError
 
 PREFIX = "pretrained:"  # names of agents that come with the package begin with it
@@ -28,6 +27,8 @@ class Best:
     @classmethod
     def of(cls, extra: Mapping[str, Any]) -> Best | None:
         """What the extra values of a checkpoint tell; None if nothing was validated up to then."""
+        from symphony.agents.checkpoint import CheckpointError  # noqa: PLC0415 - torch, which names do without
+
         found = extra.get("best")
         if found is None:
             return None
@@ -51,6 +52,8 @@ def split_name(name: str) -> tuple[Path, str]:
 
 def best_of(last: Path) -> Best | None:
     """What the last checkpoint of a run tells of its best one; None if nothing was validated."""
+    from symphony.agents.checkpoint import MANIFEST, CheckpointError, load_checkpoint  # noqa: PLC0415
+
     try:
         return Best.of(load_checkpoint(last, partial=True, restore_rng=False).extra)
     except CheckpointError as error:
@@ -66,6 +69,8 @@ def choose(folder: Path, which: str = "") -> Path:
     run was validated, else the last. Raises a :class:`ConfigError` if there is no such checkpoint, a
     :class:`CheckpointError` if the last one can't be read.
     """
+    from symphony.agents.checkpoint import CheckpointError, checkpoints  # noqa: PLC0415
+
     found = {int(path.name[-12:]): path for path in checkpoints(folder / "checkpoints")}
     if not found:
         raise ConfigError(f"{folder}: the run has no checkpoint yet")

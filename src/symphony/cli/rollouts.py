@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import field
@@ -27,7 +28,8 @@ class Simulate(shared.Simulation):
     #: Planner that drives the ego, while the agent drives the other interactive agents: `idm`, `log`, or one of your
     #: own: a file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. Then planners of
     #: other agents, by their ids in the source: `3=idm`. With `playback` as the agent all others play back the log.
-    #: There is no search unless --search, --branches or --trees say so.
+    #: There is no search unless --search, --branches or --trees say so, as each branch asks the planner: a tree then
+    #: has 4 by default, or as many as its rollouts, if those are more.
     planner: Annotated[tuple[str, ...], arg(metavar="NAME [ID=NAME ...]")] = ()
     planner_seconds: float = 60.0  # Seconds that a planner has for one answer; a longer one fails the run.
     #: Least number of runs (rollouts of a segment), evenly spread over segments, in place of `rollouts`; 0: of all.
@@ -52,10 +54,12 @@ class Simulate(shared.Simulation):
 
         agent = symphony.load_agent(self.agent, self.config.device, trust_code=self.trust_code)
         store, (planner, drives) = symphony.SegmentStore(self.data), named_planners(self.planner)
-        config = beside_planner(self.config) if planner else self.config
+        config: EvaluateConfig = self.config
+        config = dataclasses.replace(config, rollouts=config.trees) if self.runs else config
+        config = beside_planner(config) if planner else config
         chosen = shared.segment_indices(store, self.segments)
         if self.runs:
-            count, config = spread_runs(agent, config, self.runs, len(store))
+            count, config = spread_runs(agent, config, self.runs, len(store), planned=bool(planner))
             chosen = evenly_spaced(len(store), count)
         # Beside log playback nobody else is simulated.
         crowd: dict[str, Any] = {"default": 1 if planner and agent.policy is None else agent.interactive}
@@ -89,7 +93,6 @@ class View(shared.Command):
     rollouts: checks.Natural = 0  # Rollouts of a segment in a picture (0: all) or a film (0: one), at most.
 
     def __call__(self) -> None:
-        from symphony.evaluation.report import report
         from symphony.render.style import FORMATS
         from symphony.saved.folder import load_rollouts
 
@@ -101,6 +104,8 @@ class View(shared.Command):
         out = self.folders[0] / "view.html" if self.out is None else self.out
         with files.lock_file(out) if self.out is None else nullcontext():
             if out.suffix.lower() == ".html":
+                from symphony.evaluation.report import report
+
                 write_view(folders, [report(folder, picked=True) for folder in folders], out)
             elif not names:
                 raise errors.ConfigError(f"{self.folders[0]} holds no rollouts to draw")

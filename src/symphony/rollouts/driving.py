@@ -41,6 +41,7 @@ from symphony.rollouts.unroll import (
 
 RULES: dict[str, Any] = {"constant_velocity": constant_speed, "idm": CarFollower}
 """Rules that can drive background agents in place of the agent, or everyone (an agent's ``rule``)."""
+FEW = 4  # branches of a tree beside a planner, at least
 
 
 class Simulation(NamedTuple):
@@ -257,26 +258,40 @@ def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Si
 
 def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
     """The configuration beside a planner of the ego: without a search unless one is asked for, as a search asks the
-    planner once for each branch; trees where there shall be branches.
+    planner once for each branch; else in trees of a few branches of which all count, where there shall be rollouts
+    enough.
     """
     kind: Search = "tree" if config.branches or config.trees > 1 else "none"
     compiled: Compile = "no" if config.compile == "auto" else config.compile
-    asked = kind if config.search == "agent" else config.search
-    return dataclasses.replace(config, search=asked, compile=compiled)
+    asked, trees, branches = kind if config.search == "agent" else config.search, config.trees, config.branches
+    if asked == "tree" and not branches:
+        most = max(config.rollouts // FEW, 1) if trees == 1 else trees
+        trees = next(count for count in range(most, 0, -1) if config.rollouts % count == 0)
+        branches = max(config.rollouts // trees, FEW)
+    return dataclasses.replace(config, search=asked, compile=compiled, trees=trees, branches=branches)
 
 
-def spread_runs(agent: Agent, config: EvaluateConfig, runs: int, segments: int) -> tuple[int, EvaluateConfig]:
+def spread_runs(
+    agent: Agent, config: EvaluateConfig, runs: int, segments: int, *, planned: bool = False
+) -> tuple[int, EvaluateConfig]:
     """How many of the run segments give a number of runs together (a few more where it can't be divided so), and the
-    configuration with as few rollouts of each as that takes: what is independent of each other are segments.
+    configuration with as few rollouts of each as that takes: what is independent of each other are segments. Where
+    branches cost calls of a planner, no more trees grow, and so no more segments, than the runs are leaves of.
     """
-    plan, least = agent.plan(dataclasses.replace(config, rollouts=config.trees)), -(-runs // segments)
+    plan = agent.plan(dataclasses.replace(config, rollouts=config.trees))
+    whole_trees = planned and plan.kind == "tree"
+    if whole_trees:
+        leaves = plan.branches * max(config.trees, -(-runs // (plan.branches * segments)))
+        segments = -(-runs // leaves)
+    least = -(-runs // segments)
 
     def whole(each: int) -> tuple[int, int]:
         """At least so many rollouts, as many of each tree, and how many trees that takes."""
         trees = max(config.trees, -(-each // plan.branches)) if plan.kind == "tree" else 1
         return -(-each // trees) * trees, trees
 
-    exact = (each for each in range(least, min(runs + 1, 2 * least)) if runs % each == 0)
+    most = leaves + 1 if whole_trees else min(runs + 1, 2 * least)
+    exact = (each for each in range(least, most) if runs % each == 0)
     each, trees = whole(next((each for each in exact if whole(each)[0] == each), least))
     return min(segments, -(-runs // each)), dataclasses.replace(config, rollouts=each, trees=trees)
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from symphony import keys
 from symphony.agents.agent import Agent
 from symphony.agents.choice import Best
-from symphony.config import EvaluateConfig, RunConfig, ValidationConfig
+from symphony.config import EvaluateConfig, RunConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, DataError
@@ -31,6 +31,7 @@ from symphony.render import animate_rollouts
 from symphony.render.plots import saved_clip
 from symphony.rollouts.driving import simulate_batch
 from symphony.rollouts.unroll import Rollouts
+from symphony.rollouts.workers import segments_together, settled
 from symphony.saved.rollouts import saved_rollouts
 from symphony.training.logging import Tracker
 from symphony.training.trainer import Trainer
@@ -53,7 +54,7 @@ def add_hooks(trainer: Trainer) -> None:
     config, agent, device = trainer.config, trainer.agent, trainer.world.device
     shown = trainer.data
     if config.validation.data is not None:
-        trainer.validator = validator = Validator(config.validation, agent, device)
+        trainer.validator = validator = Validator(config, agent, device)
         shown = validator.dataset
     if 0 < config.preview.every <= config.steps:
         trainer.previewer = Previewer(config, agent, shown, device, trainer.replay)
@@ -68,8 +69,8 @@ class Validator:
         dataset: these segments.
     """
 
-    def __init__(self, config: ValidationConfig, agent: Agent, device: torch.device) -> None:
-        branches = agent.search.test_branches
+    def __init__(self, run: RunConfig, agent: Agent, device: torch.device) -> None:
+        config, branches = run.validation, agent.search.test_branches
         if agent.searches and config.rollouts > branches:
             most = f"search.test-branches ({branches}), the branches of one tree"
             raise ConfigError(f"validation.rollouts ({config.rollouts}) must not exceed {most}")
@@ -84,7 +85,9 @@ class Validator:
             self.dataset.scene(i)
         agent.check_step(self.dataset.dt)
         self.agent, self.device = agent, device
-        self.how = EvaluateConfig(rollouts=config.rollouts, device=str(device))
+        on = EvaluateConfig(rollouts=config.rollouts, device=str(device), compile=run.compile)
+        batches = -(-len(chosen) // segments_together(agent, on, agent.interactive))
+        self.how = settled(on, self.dataset, batches * -(-run.steps // run.checkpoint_every))  # over all validations
         self.best: Best | None = None
         self.what = f"{len(chosen)} segments of {store.checksum()}, {config.rollouts} rollouts"
 
