@@ -1,7 +1,7 @@
 """Keep freed memory for the next step instead of giving it back to the system each time (Linux with glibc).
 
 A step of a simulation frees tens of megabytes and asks for as much again. By default the kernel takes large blocks
-back and must clear their pages anew: half of a step's time at 1 000 points an agent. glibc's own variables, such as
+back and must clear their pages again: half of a step's time at 1 000 points an agent. glibc's own variables, such as
 ``MALLOC_TOP_PAD_``, take precedence; ``SYMPHONY_MALLOPT=0`` leaves all as it is.
 """
 
@@ -30,7 +30,7 @@ def release() -> bool:
 
 
 def _ours() -> Any:
-    """The C library, if it is glibc and nobody has said how it shall keep memory."""
+    """Return the C library if it is glibc and the user has not configured its memory."""
     names = {f"MALLOC_{name}_" for name in ("TRIM_THRESHOLD", "TOP_PAD", "MMAP_THRESHOLD")}
     said = bool(names & os.environ.keys()) or os.environ.get("SYMPHONY_MALLOPT", "1") in {"", "0"}
     glibc = platform.system() == "Linux" and platform.libc_ver()[0] == "glibc"

@@ -27,17 +27,17 @@ RADIUS = 20.0  # metres around an agent that its discriminator observes
 
 
 def dynamics_of(spec: AgentSpec) -> Bicycle | Displacement:
-    """The action space: MGAIL needs one that its gradient can pass (paper, section V-A)."""
+    """Return the action space of an agent: MGAIL needs a differentiable one (paper, section V-A)."""
     return Displacement() if spec.action_space == "displacement" else bicycle(spec.agent)
 
 
 def bicycle(config: AgentConfig) -> Bicycle:
-    """The discrete actions of an agent."""
+    """Return the bicycle model with the discrete actions of an agent."""
     return Bicycle(num_acceleration=config.accelerations)
 
 
 def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> ObservationConfig:
-    """What the networks observe: with the clearances that only the discriminator reads, or, as they cost, without."""
+    """Return the configuration of the observation, with or without the clearances that the discriminator reads."""
     features = spec.discriminator.features if discriminator and spec.discriminator is not None else "paper"
     gaps = spec.agent.features != "paper"
     return ObservationConfig(
@@ -53,7 +53,7 @@ def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> Observatio
 
 
 def _groups(spec: AgentSpec, *, route: bool) -> tuple[ElementGroup, ...]:
-    """What a network sees around an agent, that follows a route or not."""
+    """Return the groups of elements that a network sees around an agent, with or without a route."""
     along, gaps = 0, 0
     if spec.agent.features != "paper":
         along, gaps = ALONG_FEATURES * (route and spec.goals), 3 * (1 + len(FORESIGHT))
@@ -66,8 +66,8 @@ def _groups(spec: AgentSpec, *, route: bool) -> tuple[ElementGroup, ...]:
 
 
 def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
-    """Actions from observations, and from the route that is the goal: a categorical over the joint actions of the
-    bicycle, or a Gaussian or a histogram over displacements. Seed torch beforehand.
+    """Return a network from observations (and the route that is the goal) to actions: a categorical over the joint
+    actions of the bicycle, or a Gaussian or a histogram over displacements. Seed torch beforehand.
     """
     if spec.agent.policy != "paper":
         return build_object(spec.agent.policy, spec)
@@ -85,14 +85,14 @@ def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
 
 
 def goal_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
-    """Routes from first states, by an encoder of its own (paper, section III-B)."""
+    """Return the network that draws routes from first states, with an encoder of its own (paper, section III-B)."""
     features = CHOICE_FEATURES + TURN_FEATURES * (spec.agent.goal_features == "turns")
     sizes: dict[str, Any] = {"hidden": spec.agent.hidden, "encoder": _encoder(spec)}
     return modules.goal_policy(SELF_FEATURES, _groups(spec, route=False), features, **sizes)
 
 
 def discriminator_network(spec: AgentSpec) -> TensorDictModule:
-    """How simulated a state looks, given the goal."""
+    """Return the network that judges how simulated a state looks, given the goal."""
     config = spec.discriminator
     if config is None:
         raise ValueError("the specification has no discriminator")
@@ -127,7 +127,7 @@ FILE = "agent.json"  # file in a run's folder that holds the agent's specificati
 
 
 class SearchPlan(NamedTuple):
-    """How the rollouts of a run segment come about, with nothing left open."""
+    """The way in which the rollouts of a run segment are simulated, with no setting left open."""
 
     kind: Literal["log", "none", "tree", "backtrack"]  # of search; log for playback
     trees: int  # of the run segment; independent rollouts are trees of one branch
@@ -138,7 +138,7 @@ class SearchPlan(NamedTuple):
 
 @dataclass(frozen=True)
 class Agent:
-    """A policy and what it needs around it."""
+    """A policy with the other networks and the settings that its simulation needs."""
 
     name: str  # as given by the user
     policy: TensorDictModuleBase | None  # writes actions; None for log playback
@@ -150,27 +150,27 @@ class Agent:
 
     @property
     def dynamics(self) -> Bicycle | Displacement:
-        """The action space it acts in."""
+        """The action space in which it acts."""
         return Bicycle() if self.spec is None else dynamics_of(self.spec)
 
     @property
     def observation(self) -> ObservationConfig:
-        """What it observes, the input of its discriminator included."""
+        """The configuration of its observation, including the input of its discriminator."""
         return ObservationConfig.nothing() if self.spec is None else observation_of(self.spec)
 
     @property
     def interactive(self) -> int:
-        """How many agents of a run segment it was trained with (2 for baselines)."""
+        """The number of agents of a run segment that it was trained with (2 for baselines)."""
         return 2 if self.spec is None else self.spec.agent.interactive
 
     @property
     def duration(self) -> int:
-        """Seconds of a run segment it was trained with; 0 for all."""
+        """The seconds of a run segment that it was trained with; 0 for all."""
         return 0 if self.spec is None else self.spec.duration
 
     @property
     def search(self) -> SearchConfig:
-        """How branches are pruned, where there is a discriminator."""
+        """The settings by which its branches are pruned, where there is a discriminator."""
         return SearchConfig() if self.spec is None else self.spec.search
 
     @property
@@ -185,12 +185,12 @@ class Agent:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """The networks that it has, by name."""
+        """Its networks by name."""
         parts = {"policy": self.policy, "goals": self.goals, "discriminator": self.discriminator}
         return {name: module for name, module in parts.items() if module is not None}
 
     def plan(self, config: EvaluateConfig) -> SearchPlan:
-        """How the rollouts of a run segment come about.
+        """Return how the rollouts of a run segment are simulated.
 
         Raises a :class:`ConfigError` where the search needs a discriminator that it lacks, or trees are too small.
         """
@@ -219,7 +219,7 @@ class Agent:
         return self
 
     def check_step(self, dt: float) -> None:
-        """Raise ConfigError if the agent learned another time step than ``dt`` seconds."""
+        """Raise ConfigError if the agent learned with a time step other than ``dt`` seconds."""
         if self.spec is not None and abs(self.spec.dt - dt) > 1e-6:
             raise ConfigError(
                 f"{self.name} learned steps of {self.spec.dt:g} s and can't drive in steps of {dt:g} s; "
@@ -228,14 +228,14 @@ class Agent:
 
 
 def build_agent(name: str, spec: AgentSpec) -> Agent:
-    """An agent with fresh networks; seed torch beforehand."""
+    """Build an agent with fresh networks; seed torch beforehand."""
     policy, goals = policy_network(spec), goal_network(spec) if spec.goals else None
     discriminator = None if spec.discriminator is None else discriminator_network(spec)
     return Agent(name, policy, spec, goals, discriminator)
 
 
 def load_agent(name: str, device: str = "cpu", *, trust_code: bool = False) -> Agent:
-    """An agent by name.
+    """Load an agent by its name.
 
     Args:
         name: ``playback``, ``constant_velocity``, ``idm`` (the intelligent driver model, along the route of the log),
@@ -270,7 +270,7 @@ def load_agent(name: str, device: str = "cpu", *, trust_code: bool = False) -> A
 
 
 def _check_code(spec: AgentSpec, file: Path, trusted: bool) -> None:
-    """See that a specification from a file names code only where the user trusts it, and import that."""
+    """Check that a specification from a file names code only where the user trusts it, and import that code."""
     for setting, path in spec.code.items():
         if not trusted:
             raise ConfigError(
@@ -286,7 +286,7 @@ def _check_code(spec: AgentSpec, file: Path, trusted: bool) -> None:
 
 
 def _check_sizes(name: str, spec: AgentSpec, file: Path, checkpoint: Path) -> None:
-    """See that networks are no larger than their weights on the disk, before they take memory."""
+    """Check that networks are no larger than their weights on disk, before they take memory."""
     try:
         with torch.device("meta"):
             modules = build_agent(name, spec).modules
@@ -300,7 +300,7 @@ def _check_sizes(name: str, spec: AgentSpec, file: Path, checkpoint: Path) -> No
 
 
 def usable_device(name: str) -> torch.device:
-    """A device by its name; a ConfigError where there is none of that name."""
+    """Return the device of a name; raise a ConfigError if there is none of that name."""
     try:
         device = torch.device(name)
     except RuntimeError as error:
@@ -318,7 +318,7 @@ def usable_device(name: str) -> torch.device:
 
 
 def read_spec(folder: Path) -> AgentSpec:
-    """The specification of the agent that a run trains; a ConfigError if the folder is no run."""
+    """Return the specification of the agent that a run trains; raise a ConfigError if the folder is not a run."""
     path = folder / FILE
     if not path.is_file():
         known = f"'{PLAYBACK}', 'constant_velocity', 'idm', 'random', '{PREFIX}NAME'"

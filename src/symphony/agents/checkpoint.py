@@ -39,7 +39,7 @@ class CheckpointError(DataError):
 
 
 class LoadedCheckpoint(NamedTuple):
-    """The step that a checkpoint was saved at, and the caller's own values in it."""
+    """The step at which a checkpoint was saved, and the caller's own values in it."""
 
     step: int
     extra: dict[str, Any]
@@ -57,7 +57,7 @@ def save_checkpoint(
 
     The checkpoint appears complete or not at all; one of the same step is replaced. One process writes at a time.
 
-    The folder is that of all checkpoints of the run, and made if absent. Modules are saved by name, by their
+    The folder is that of all checkpoints of the run, and created if absent. Modules are saved by name, by their
     `state_dict`, and so is whatever else keeps a state (optimizers, a schedule of learning rates); ``extra`` are
     JSON-like values, also tuples and tensors, that :func:`load_checkpoint` hands back.
 
@@ -136,7 +136,7 @@ def load_checkpoint(
 
 
 def checkpoints(folder: Path) -> list[Path]:
-    """All complete checkpoints in `folder`, by ascending step."""
+    """Return all complete checkpoints in `folder`, by ascending step."""
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         # A parked one, which sorts first, counts only if the crash came before its successor took its place.
@@ -147,19 +147,19 @@ def checkpoints(folder: Path) -> list[Path]:
 
 
 def parts_of(path: Path) -> set[str]:
-    """Names of the modules that a checkpoint holds."""
+    """Return the names of the modules in a checkpoint."""
     parts = _read_manifest(path)["parts"]
     return {name.removeprefix("module.") for name in parts if name.startswith("module.")}
 
 
 def latest(folder: Path) -> Path | None:
-    """The complete checkpoint of the highest step in `folder`, or None."""
+    """Return the complete checkpoint of the highest step in `folder`, or None."""
     return next(reversed(checkpoints(folder)), None)
 
 
 def prune(folder: Path, keep: int, *, protect: Collection[int] = ()) -> None:
-    """Delete all but the last `keep` checkpoints (at least one) and those of the steps in `protect`, and what a kill
-    in an earlier deletion has left; a CheckpointError if the disk refuses.
+    """Delete all but the last `keep` checkpoints (at least one) and those of the steps in `protect`, and what an
+    interrupted deletion has left; a CheckpointError if the disk refuses.
     """
     try:
         for path in checkpoints(folder)[:-keep]:
@@ -213,7 +213,7 @@ def _flush(path: Path) -> None:
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
-    """What the manifest of a checkpoint says, checked but for the states inside."""
+    """Return the manifest of a checkpoint, checked except for the states inside."""
     file = path / MANIFEST
 
     def refused(what: str, field: str | None = None) -> CheckpointError:
@@ -245,13 +245,13 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 
 def _checksum(manifest: Mapping[str, Any]) -> str:
-    """The checksum of all other values that a manifest holds."""
+    """Return the checksum of all other values that a manifest holds."""
     held = {name: value for name, value in manifest.items() if name != "sha256"}
     return hashlib.sha256(json.dumps(held, sort_keys=True).encode()).hexdigest()
 
 
 def _read_part(path: Path, manifest: dict[str, Any], part: str) -> dict[str, Any]:
-    """The state of a module or an optimizer, the random states, or the caller's values."""
+    """Return the state of a module or an optimizer, the random states, or the caller's values."""
     file, tensors = path / f"{part}.safetensors", {}
     try:
         entry = manifest["parts"][part]
@@ -274,7 +274,7 @@ def _read_part(path: Path, manifest: dict[str, Any], part: str) -> dict[str, Any
 
 
 def _match(file: Path, own: Mapping[str, Any], saved: Mapping[str, Any]) -> None:
-    """See that a saved state has the tensors of a module, and that all are finite."""
+    """Check that a saved state has the tensors of a module, and that all are finite."""
     for name in [*own, *saved]:
         if name not in saved or name not in own:
             where = "the module" if name in own else "the checkpoint"
@@ -318,7 +318,7 @@ def encode(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
 
 
 def decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
-    """What :func:`encode` was given (mappings as plain dicts)."""
+    """Reverse :func:`encode`; mappings become plain dicts."""
     if isinstance(value, list):
         return [decode(item, tensors) for item in value]
     if not isinstance(value, dict):

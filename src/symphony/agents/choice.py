@@ -1,4 +1,4 @@
-"""Which checkpoint of a run is its agent: the best by validation, the last, or one that is named; included agents."""
+"""The choice of a run's checkpoint: the best by validation, the last, or a named one; the included agents."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Best:
 
     @classmethod
     def of(cls, extra: Mapping[str, Any]) -> Best | None:
-        """What the extra values of a checkpoint tell; None if nothing was validated up to then."""
+        """Read it from the extra values of a checkpoint; None if nothing was validated by then."""
         from symphony.agents.checkpoint import CheckpointError  # noqa: PLC0415 - torch, which names do without
 
         found = extra.get("best")
@@ -39,7 +39,7 @@ class Best:
 
 
 def split_name(name: str) -> tuple[Path, str]:
-    """From ``RUN[@WHICH]``, the folder of a run and which of its checkpoints is meant ("" if it doesn't say);
+    """Split ``RUN[@WHICH]`` into the folder of a run and which of its checkpoints is meant ("" if it doesn't say);
     ``pretrained:NAME`` is the folder of an agent that comes with the package.
     """
     if name.startswith(PREFIX):
@@ -51,7 +51,7 @@ def split_name(name: str) -> tuple[Path, str]:
 
 
 def best_of(last: Path) -> Best | None:
-    """What the last checkpoint of a run tells of its best one; None if nothing was validated."""
+    """Return the best checkpoint of a run, as its last one records it; None if nothing was validated."""
     from symphony.agents.checkpoint import MANIFEST, CheckpointError, load_checkpoint  # noqa: PLC0415
 
     try:
@@ -61,7 +61,7 @@ def best_of(last: Path) -> Best | None:
 
 
 def choose(folder: Path, which: str = "") -> Path:
-    """The checkpoint of a run that is meant.
+    """Return the checkpoint of a run that ``which`` names.
 
     The last one knows which is the best, so that there is no second record to fall out of step with it.
 
@@ -91,12 +91,12 @@ def choose(folder: Path, which: str = "") -> Path:
 
 
 def pretrained_names() -> list[str]:
-    """All there are, without prefix."""
+    """Return the names of all included agents, without prefix."""
     return sorted(path.parent.name for path in FOLDER.glob("*/agent.json"))
 
 
 def pretrained_folder(name: str) -> Path:
-    """The folder of ``pretrained:NAME``; a ConfigError says which there are if it is none of them."""
+    """Return the folder of ``pretrained:NAME``; a ConfigError lists the names if there is no such agent."""
     wanted, names = name.removeprefix(PREFIX), pretrained_names()
     if wanted not in names:
         close = difflib.get_close_matches(wanted, names, 1)
@@ -107,7 +107,7 @@ def pretrained_folder(name: str) -> Path:
 
 
 def read_card(folder: Path) -> dict[str, Any]:
-    """The model card in the folder of an agent: ``name``, ``method``, ``about``, ``training``, ``settings``,
+    """Return the model card in the folder of an agent: ``name``, ``method``, ``about``, ``training``, ``settings``,
     ``scores`` (one for each data set it was evaluated on) and ``limits``.
     """
     file = folder / CARD

@@ -1,1 +1,1 @@
-"""The test bench for planners: suites of thresholds, what decides them, and what is written of them."""
+"""The test bench for planners: suites of thresholds, their verdicts, and the pages and files that tell them."""

@@ -1,4 +1,4 @@
-"""How critical driving is for the ego: which run segments, or which rollouts of them, are the hard ones.
+"""How critical driving is for the ego: the hardest run segments of a store, or rollouts of a folder.
 
 Sources: least time to collision (Hayward 1972), post-encroachment time (Allen, Shin and Cooper 1978).
 """
@@ -34,7 +34,7 @@ NEAR_EDGE = 0.5
 
 @dataclass(frozen=True)
 class Criticality:
-    """How critical a drive of the ego is.
+    """The criticality of a drive of the ego.
 
     Attributes:
         segment: id.
@@ -55,7 +55,7 @@ class Criticality:
 
     @property
     def score(self) -> float:
-        """From 0, nothing is critical, to 4, as critical as can be: up to 1 for each of the four."""
+        """A score from 0 (nothing is critical) to 4: each of the four quantities adds up to 1."""
         parts = (
             1 - self.time_to_collision / LONGEST,
             1 - self.encroachment / LONGEST,
@@ -66,8 +66,8 @@ class Criticality:
 
 
 def criticality(found: RunSegment | SavedRollouts, rollout: int | None = None) -> Criticality:
-    """How critical a log or a rollout is for its ego; others on another level do not count. Boxes that overlap in a
-    log are wrongly measured ones; in a rollout the ego collides, and the time to collision is 0.
+    """Return how critical a log or a rollout is for its ego; agents on another level do not count. Boxes that overlap
+    in a log are measurement errors; in a rollout the ego collides, and the time to collision is 0.
     """
     if isinstance(found, SavedRollouts):
         segment, world = found.segment, world_of(found, rollout or 0)
@@ -97,7 +97,7 @@ def criticality(found: RunSegment | SavedRollouts, rollout: int | None = None) -
 
 
 def _encroachment(world: World, segment: RunSegment, seen: NDArray[np.int64], ego: NDArray[np.object_]) -> float:
-    """Least seconds between the boxes of the ego and of one who crosses its way, at the same place at two steps."""
+    """Return the least seconds between the ego's box and that of an agent crossing its path at the same place."""
     who, step = world.valid.nonzero()
     who, step = who[who != segment.ego], step[who != segment.ego]
     mine, theirs = shapely.STRtree(_boxes(world, who, step)).query(ego, predicate="intersects")
@@ -115,7 +115,7 @@ def _encroachment(world: World, segment: RunSegment, seen: NDArray[np.int64], eg
 
 
 def _boxes(world: World, row: NDArray[np.int64], step: NDArray[np.int64]) -> NDArray[np.object_]:
-    """Boxes of agents at steps, as polygons."""
+    """Return the boxes of agents at steps, as polygons."""
     half = 0.5 * world.size[row][:, None]
     x, y = (np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half).transpose(2, 0, 1)
     cos, sin = (part(world.heading[row, step])[:, None] for part in (np.cos, np.sin))
@@ -130,8 +130,8 @@ def hardest(
     items: Sequence[int] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[tuple[int, Criticality]]:
-    """So many of the most critical run segments of a store (or of these rows of it), or rollouts of a folder, the
-    hardest first; equal ones in their order. ``progress`` is called with the segments looked at and their total.
+    """Return the ``count`` most critical run segments of a store (or of its rows ``items``), or rollouts of a folder,
+    the hardest first; equal ones in their order. ``progress`` is called with the number looked at and the total.
     """
     rows, found = range(len(source)) if items is None else items, list[tuple[int, Criticality]]()
     for number, row in enumerate(rows):

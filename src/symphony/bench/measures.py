@@ -1,6 +1,6 @@
-"""What a suite can measure of a planner, and how sure a measure is: intervals over groups of segments.
+"""The measures of a planner in a suite, and their confidence: intervals over groups of segments.
 
-Runs of one recording share its traffic, so groups are what was drawn independently. Sources: Clopper and Pearson,
+Runs of one recording share its traffic, so the groups are the independent samples. Sources: Clopper and Pearson,
 Biometrika 26 (1934); for groups Korn and Graubard, "Confidence intervals for proportions with small expected number
 of positive counts estimated from survey data", Survey Methodology 24 (1998).
 """
@@ -23,8 +23,8 @@ Run = dict[str, Any]
 
 @dataclass(frozen=True)
 class Measure:
-    """A number of each run, None where it is not defined: a ``rate``, 100 for a run in which something happens and 0
-    for any other, or a ``mean``; with its unit and what it says, for people.
+    """A number for each run, None where it is not defined: a ``rate``, 100 for a run in which something happens and 0
+    for any other, or a ``mean``; with its unit and a description for people.
     """
 
     of: Callable[[Run], float | None]
@@ -69,9 +69,9 @@ MEASURES: dict[str, Measure] = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over runs that have such a number, None without any, and the groups of segments that they are of.
+    """The mean over the runs that have a number, None if none has, and the groups of their segments.
 
-    With the confidence that was asked for the mean is not below ``low``, and with the same not above ``high``; None
+    With the given confidence the mean is not below ``low``, and with the same confidence not above ``high``; None
     where that is not known.
     """
 
@@ -88,8 +88,8 @@ def estimate(
     confidence: float,
     kind: Literal["rate", "mean"] = "mean",
 ) -> Estimate:
-    """The mean of the values of some runs (None where not defined; a rate's are 0 and 100) and its one-sided bounds
-    over groups, each with a confidence between 0.5 and 1.
+    """Return the mean of the values of some runs (None where not defined; a rate's are 0 and 100) and its one-sided
+    bounds over groups, each with a confidence between 0.5 and 1.
 
     Bounds of a mean are Student's t; those of a rate are the exact binomial ones of as many independent runs as the
     scatter between groups says there are, and of as many as there are groups where nothing or everything happened.
@@ -111,13 +111,13 @@ def estimate(
 
 
 def measured(runs: Sequence[Run], measure: Measure, confidence: float = 0.95) -> Estimate:
-    """The mean of a measure over runs, with its bounds."""
+    """Return the mean of a measure over runs, with its bounds."""
     groups = [run["group"] for run in runs]
     return estimate([measure.of(run) for run in runs], groups, confidence, measure.kind)
 
 
 def _rate_bound(value: NDArray[np.float64], group: NDArray[np.int64], groups: int, confidence: float) -> float:
-    """Upper bound of a rate from 0 to 1 (Korn and Graubard).
+    """Return the upper bound of a rate from 0 to 1 (Korn and Graubard).
 
     The scatter between groups is taken with one more group in which it always happened: of a rare event that some
     groups have throughout, few groups alone show too little scatter (in simulations the bound then held in 88 % of
@@ -140,14 +140,14 @@ def _rate_bound(value: NDArray[np.float64], group: NDArray[np.int64], groups: in
 
 
 def needed_groups(limit: float, confidence: float) -> int:
-    """Groups of which none may show an event before a rate is known to be at most a limit in percent, above 0."""
+    """Return how many groups without an event it takes to know that a rate is at most ``limit`` percent, above 0."""
     return 1 if limit >= 100 else math.ceil(math.log(1 - confidence) / math.log1p(-limit / 100.0))
 
 
 def paired(
     runs: Sequence[Run], others: Sequence[Run], of: Callable[[Run], float | None]
 ) -> tuple[list[float | None], list[str]]:
-    """Differences of a number between the runs of two planners in the same segment and rollout, and their groups."""
+    """Return the differences of a number between two planners' runs of one segment and rollout, and their groups."""
     base = {(run["segment"], run["rollout"]): of(run) for run in others}
     both = [run for run in runs if (run["segment"], run["rollout"]) in base]
     values: list[float | None] = []

@@ -29,7 +29,7 @@ th, td { text-align: left; padding: .3rem .6rem; border-bottom: 1px solid #ddd }
 
 
 def junit(result: Result) -> str:
-    """JUnit XML: a test suite for each planner and crowd, a test case for each threshold."""
+    """Return JUnit XML: a test suite for each planner and crowd, a test case for each threshold."""
     root = ET.Element("testsuites", name=_safe(result.suite.name), time=f"{result.seconds:.1f}")
     for pair in result.pairs:
         mine = [one for one in result.verdicts if f"{one.planner} among {one.crowd}" == pair.name]
@@ -48,7 +48,7 @@ def junit(result: Result) -> str:
 
 
 def sentence(one: Verdict) -> str:
-    """What was found, in words."""
+    """Describe a verdict in words."""
     if one.found.mean is None or one.bound is None:
         return f"{one.threshold}: not defined in {one.found.runs} runs of {one.found.groups} groups"
     bound = ""
@@ -59,7 +59,7 @@ def sentence(one: Verdict) -> str:
 
 
 def _what(run: dict[str, Any]) -> str:
-    """What happened in a run that was bad, in words."""
+    """Describe in words what went wrong in a run."""
     if run["failed"]:
         return f"fails: {run['failed']}"
     return ", ".join(text for name, text in EVENTS.items() if run[name])
@@ -74,7 +74,7 @@ def _lines(pair: Pair) -> Iterable[str]:
 
 
 def page(result: Result, *, view: bool = True) -> str:
-    """One page: verdicts, numbers, regressions and the bad runs, each a click away from its replay."""
+    """Return one page: verdicts, numbers, regressions and the bad runs, each a click away from its replay."""
     suite, word = result.suite, "passes" if result.passed else "fails"
     config = suite.crowds[0].config
     parts = [
@@ -121,7 +121,7 @@ def _link(pair: Pair, run: dict[str, Any]) -> str:
 def _table(
     title: str, heads: Sequence[str], rows: Sequence[Sequence[Any]], marks: Sequence[str] | None = None
 ) -> str:
-    """A table of text under a title, with marks of ours, which are HTML, before its lines."""
+    """Return a table of text under a title, with our own marks, which are HTML, before its lines."""
     lines = [[escape(printable(str(cell))) for cell in row] for row in rows]
     if marks is not None:
         heads, lines = ("", *heads), [[mark, *line] for mark, line in zip(marks, lines, strict=True)]
@@ -131,5 +131,5 @@ def _table(
 
 
 def _safe(text: str) -> str:
-    """Text that XML can hold."""
+    """Return a text without the characters that XML cannot hold."""
     return printable(text, keep="\n")

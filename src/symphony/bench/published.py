@@ -49,17 +49,17 @@ class PDM(NamedTuple):
 
     @property
     def score(self) -> float:
-        """From 0 to 100."""
+        """The score from 0 to 100."""
         weighted = 5 * self.progress + 5 * self.time_to_collision + 2 * self.comfort
         return 100.0 * self.no_collision * self.on_road * weighted / 12
 
 
 def pdm(run: Mapping[str, Any], saved: SavedRollouts, collisions: list[int]) -> PDM | None:
-    """The terms of one run of the ego; None where it failed, or the road's boundary or its progress is not defined.
+    """Return the terms of one run of the ego; None if it failed, or the boundary or its progress is not defined.
 
     Args:
         run: its row of :class:`symphony.evaluation.report.Report`.
-        saved: the rollouts it is one of.
+        saved: the rollouts that it is one of.
         collisions: rows of the agents that it ran into, at fault.
     """
     if run["failed"] or run["offroad_time"] is None:
@@ -84,7 +84,7 @@ def pdm(run: Mapping[str, Any], saved: SavedRollouts, collisions: list[int]) -> 
 
 
 def comfortable(heading: Reals, speed: Reals, dt: float) -> bool:
-    """Whether a drive of headings [U] (radians) and speeds [U] (m/s), dt seconds apart, keeps all limits."""
+    """Return whether a drive of headings [U] (radians) and speeds [U] (m/s), dt seconds apart, keeps all limits."""
     if len(speed) < 3:
         return True
     turned = np.unwrap(heading)
@@ -106,8 +106,8 @@ def comfortable(heading: Reals, speed: Reals, dt: float) -> bool:
 
 
 def derivative(values: Reals, dt: float, order: int) -> Reals:
-    """[U] derivative of [U] values: of the polynomial of second degree (third for a second derivative) that fits best
-    within :data:`WINDOW` around each (Savitzky and Golay 1964); at the ends of that of the first and last window.
+    """Return the derivative [U] of values [U]: of the polynomial of second degree (third for a second derivative)
+    that fits best within :data:`WINDOW` around each (Savitzky and Golay 1964); at the ends, of the last whole window.
     """
     width = min(len(values), max(order + 2, 2 * round(0.5 * WINDOW / dt) + 1))
     degree = min(order + 1, width - 1)

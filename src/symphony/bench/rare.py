@@ -52,13 +52,13 @@ FEW = 4
 
 
 def resampling() -> Systematic:
-    """The rule by which branches go on: where less than half of them carry the weight."""
+    """Return the rule that resamples branches where less than half of them carry the weight."""
     return Systematic(temperature=1.0, threshold=0.5)
 
 
 def leaf_weights(found: BeamSearchResult) -> Float[Tensor, "*b L"]:
-    """Weights of the leaves of a search whose totals are 0: the mean of their products with anything that is a number
-    of a leaf is an estimate, without bias, of its expectation over free rollouts.
+    """Return the weights of the leaves of a search whose totals are 0: the mean of their products with any number of
+    a leaf is an unbiased estimate of its expectation over free rollouts.
     """
     if found.leaf_log_weights is None or found.log_evidence is None:
         raise ValueError("the rule of this search does not weigh")
@@ -67,12 +67,12 @@ def leaf_weights(found: BeamSearchResult) -> Float[Tensor, "*b L"]:
 
 @dataclass(frozen=True)
 class Rate:
-    """How often something happens in a run segment: a share, its standard error over trees, in how many trees it was
-    seen, how many of the runs that show it are kept, and why there is no share where the planner failed.
+    """The rate of an event in a run segment: a share, its standard error over trees, in how many trees it was seen,
+    how many of the runs that show it are kept, and why there is no share where the planner failed.
 
     ``segment`` is None for the mean over segments that have a share; its error is that for these, not for others.
     NaN: the metric is not defined there, or, of an error, nothing was seen that would have one. A share above 1 is no
-    mistake: few branches scatter to both sides of what is true.
+    mistake: with few branches the estimate scatters to both sides.
     """
 
     segment: str | None
@@ -85,7 +85,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class Hunt:
-    """Simulates a planner in trees that are weighed, in scenes with routes whose first agents are egos.
+    """Simulates a planner in weighted trees, in scenes with routes whose first agents are egos.
 
     ``config`` says how many; ``metric`` is a rate of :data:`symphony.bench.measures.MEASURES`.
     """
@@ -97,7 +97,7 @@ class Hunt:
     metric: str
 
     def __call__(self, items: list[int]) -> list[tuple[SavedRollouts, Rate]]:
-        """Of each segment a few of the runs that show what the metric counts, and how often it happens."""
+        """Return for each segment a few of the runs that show the counted event, and the rate of the event."""
         agent, config, name = self.agent, self.config, planner_name(self.planner)
         with naming(self.dataset, items):
             scenes = self.dataset.scenes(items).to(torch.device(config.device))
@@ -124,7 +124,7 @@ class Hunt:
 
 
 def _kept(saved: SavedRollouts, hits: NDArray[np.bool_]) -> SavedRollouts:
-    """The first run of each tree [R, S] that shows it, few of them."""
+    """Return the first run of each tree [R, S] that shows the event, up to a few."""
     rows = [int(k) * hits.shape[1] + int(hits[k].argmax()) for k in np.flatnonzero(hits.any(1))[:KEPT]]
     names = ("state", "counted", "collision", "offroad", "goal")
     parts: dict[str, Any] = {name: getattr(saved, name)[rows] for name in names}
@@ -133,22 +133,22 @@ def _kept(saved: SavedRollouts, hits: NDArray[np.bool_]) -> SavedRollouts:
 
 
 def _rate(kept: SavedRollouts, estimates: NDArray[np.float64], why: str) -> Rate:
-    """The mean of the estimates of independent trees."""
+    """Return the mean of the estimates of independent trees."""
     trees = int((estimates > 0).sum())
     error = float(estimates.std(ddof=1)) / math.sqrt(len(estimates)) if trees else math.nan
     return Rate(kept.segment.segment_id, float(estimates.mean()), error, trees, kept.rollouts, why)
 
 
 def hunt(path: Path, hunter: Hunt, progress: Callable[[int, int], None] | None = None) -> list[Rate]:
-    """The rates in all segments and, last, their mean; a few runs of each that show it are kept in a folder, in which
-    the same hunt finds them again.
+    """Return the rates in all segments and, last, their mean; a few runs of each that show the event are kept in a
+    folder, where the same hunt finds them again.
 
-    Segments in which the planner failed, or whose ego can't be driven, are put on record as failed there.
+    Segments in which the planner failed, or whose ego can't be driven, are recorded as failed there.
 
     Raises:
         AllFailedError: the planner failed in every segment.
         ConfigError: nothing is drawn at random around the planner, it can't be copied, or there is no such rate.
-        SymphonyError: as of :func:`symphony.saved.saving.save_simulation`.
+        SymphonyError: as for :func:`symphony.saved.saving.save_simulation`.
     """
     agent, data, config = hunter.agent, hunter.dataset, hunter.config
     planner_maker(hunter.planner)  # or complain before anything is simulated
@@ -193,7 +193,7 @@ def hunt(path: Path, hunter: Hunt, progress: Callable[[int, int], None] | None =
 
 
 def remarks(found: list[Rate]) -> list[str]:
-    """What must be said of rates, the mean last, so that nobody takes them for more than they are."""
+    """Return the caveats of rates, the last of which is the mean."""
     out = [f"{one.segment}: the planner {one.failed}" for one in found if one.failed]
     if any(one.rate > 1 for one in found):
         out.append("a rate came to more than 100 %: take more branches")

@@ -41,7 +41,7 @@ Progress = Callable[[str, int, int], None] | None
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a planner keeps a threshold in a crowd.
+    """The verdict on whether a planner keeps a threshold in a crowd.
 
     Attributes:
         status: ``undecided`` where the metric is not defined, or the pair was stopped before it was known.
@@ -70,12 +70,12 @@ class Pair:
 
     @property
     def name(self) -> str:
-        """Both names."""
+        """The names of the planner and the crowd."""
         return f"{self.planner.name} among {self.crowd.name}"
 
     @property
     def runs(self) -> list[Run]:
-        """A row for each run."""
+        """The report's row for each run."""
         return self.report.rows
 
     @property
@@ -86,7 +86,7 @@ class Pair:
 
 @dataclass
 class Result:
-    """What a suite found."""
+    """The result of a suite."""
 
     suite: Suite
     pairs: list[Pair]
@@ -100,7 +100,7 @@ class Result:
         return all(one.status == "passes" for one in self.verdicts)
 
     def plain(self) -> dict[str, Any]:
-        """All of it, as JSON can hold it."""
+        """Return all of it in types that JSON can hold."""
 
         def verdict(one: Verdict) -> dict[str, Any]:
             limit, found = one.threshold, one.found
@@ -134,8 +134,8 @@ class Result:
 
 
 def run_suite(suite: Suite, out: Path, progress: Progress = None, *, view: bool = True) -> Result:
-    """Simulate and judge a suite; what was interrupted goes on where it stopped. In the folder ``out`` come to lie
-    ``result.json`` and, below ``PLANNER/CROWD``, the rollouts, with a page that plays them if there shall be a view.
+    """Simulate and judge a suite; an interrupted one continues where it stopped. The folder ``out`` receives
+    ``result.json`` and, below ``PLANNER/CROWD``, the rollouts, with a page that plays them if ``view`` is true.
 
     Raises:
         AllFailedError: every run failed.
@@ -207,7 +207,7 @@ def _drive(suite: Suite, pair: Pair, progress: Progress) -> None:
 
 
 def with_pdm(found: Report, folder: RolloutFolder) -> list[Run]:
-    """The rows of a report with the PDM score of each run."""
+    """Return the rows of a report with the PDM score of each run."""
     rows = {(row["segment"], row["rollout"]): row for row in found.rows}
     for saved in folder:
         name = saved.segment.segment_id
@@ -219,7 +219,7 @@ def with_pdm(found: Report, folder: RolloutFolder) -> list[Run]:
 
 
 def _beyond(one: Threshold, pair: Pair) -> bool:
-    """Whether a rate will be beyond its limit even if nothing happens in the runs that are left.
+    """Return whether a rate will be beyond its limit even if nothing happens in the remaining runs.
 
     The mean of all runs is beyond the limit then, and so is its bound: stopping changes no verdict.
     """
@@ -233,7 +233,7 @@ def _beyond(one: Threshold, pair: Pair) -> bool:
 
 
 def _thresholds(suite: Suite, pair: Pair) -> list[Threshold]:
-    """Those of a pair. A failed run is no good run: if nothing is said of them, none may fail."""
+    """Return the thresholds of a pair. Failed runs are bad: if no threshold allows them, none may fail."""
     planner, crowd = pair.planner.name, pair.crowd.name
     found = [one for one in suite.thresholds if planner in one.planners and crowd in one.crowds]
     # The baseline is not compared with itself.
@@ -244,7 +244,7 @@ def _thresholds(suite: Suite, pair: Pair) -> list[Threshold]:
 
 
 def judged(suite: Suite, pair: Pair, base: Sequence[Run]) -> list[Verdict]:
-    """The verdicts of a pair after its runs, compared with the baseline's in this crowd."""
+    """Return the verdicts of a pair after its runs, compared with the baseline's in this crowd."""
     found = []
     for one in _thresholds(suite, pair):
         measure, sure = MEASURES[one.metric], one.confidence or 0.95
@@ -264,7 +264,7 @@ def judged(suite: Suite, pair: Pair, base: Sequence[Run]) -> list[Verdict]:
 
 
 def find_regressions(pair: Pair, base: Sequence[Run]) -> list[dict[str, Any]]:
-    """Runs that were worse than the baseline's of the same segment and rollout, and how."""
+    """Return the runs that were worse than the baseline's of the same segment and rollout, and how."""
     before = {(run["segment"], run["rollout"]): run for run in base}
     found = []
     for run in pair.runs:
@@ -283,7 +283,7 @@ def find_regressions(pair: Pair, base: Sequence[Run]) -> list[dict[str, Any]]:
 
 
 def _earlier(suite: Suite) -> dict[tuple[str, str], list[Run]]:
-    """Runs of an earlier result that is the baseline, by planner and crowd."""
+    """Return the runs of an earlier result that is the baseline, by planner and crowd."""
     if not isinstance(suite.baseline, Path):
         return {}
     try:

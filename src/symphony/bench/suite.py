@@ -55,7 +55,7 @@ class SuitePlanner(NamedTuple):
 
 
 class Crowd(NamedTuple):
-    """Who drives around it."""
+    """The agents that drive around a planner."""
 
     name: str
     agent: str
@@ -67,13 +67,13 @@ N = TypeVar("N", SuitePlanner, Crowd)
 
 @dataclass(frozen=True)
 class Threshold:
-    """What must be true of some planners in some crowds.
+    """A threshold that some planners must keep in some crowds.
 
     Attributes:
         metric: a name of :data:`symphony.bench.measures.MEASURES`.
         limit: in the unit of the metric.
         side: on which side of it the mean must be.
-        confidence: with which it must be known to be there; None: the mean itself decides.
+        confidence: with which the mean must be known to be on that side; None: the mean itself decides.
         compared: whether the metric is the difference from the baseline, run by run.
     """
 
@@ -95,7 +95,7 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Suite:
-    """All of a suite.
+    """A suite, read and checked.
 
     Attributes:
         items: rows of the store that are driven, in the order in which they are.
@@ -167,7 +167,7 @@ def read_suite(path: Path, **shared: Any) -> Suite:
 
 @dataclass(frozen=True)
 class _File:
-    """A file and its lines, to say where something is wrong."""
+    """A file and its lines, to locate errors in it."""
 
     path: Path
     lines: list[str]
@@ -178,7 +178,7 @@ class _File:
         return ConfigError(f"{where}, {key}: {why}" if key else f"{where}: {why}")
 
     def _line(self, table: str, k: int, key: str) -> int:
-        """Where a key of the k-th such table is, else its head, else the first line that begins like it."""
+        """Return the line of a key in the k-th such table, else of its head, else the first that begins like it."""
         head = re.compile(rf"\s*\[+\s*{re.escape(table)}\s*\]+\s*(#.*)?$")
         heads = [number for number, line in enumerate(self.lines, 1) if head.match(line)]
         if k >= len(heads):
@@ -192,13 +192,13 @@ class _File:
         return heads[k]
 
     def beside(self, given: str) -> str:
-        """A path relative to the file; other names as they are."""
+        """Return a path beside the file if it exists; other names as they are."""
         beside = self.path.parent / given
         return str(beside) if beside.exists() else given
 
 
 class _Table:
-    """The k-th table of a name, or the only one, with keys and types that are known."""
+    """The k-th table of a name, or the only one, with its keys and types checked."""
 
     def __init__(self, file: _File, name: str, k: int | None, given: Any) -> None:
         self.file, self.name, self.k, self.given = file, name, k, given
@@ -219,7 +219,7 @@ class _Table:
 
     @contextmanager
     def at(self, key: str) -> Iterator[None]:
-        """What goes wrong inside is wrong with a key."""
+        """Attribute errors raised inside to a key of the table."""
         try:
             yield
         except (SymphonyError, OSError) as error:
@@ -237,7 +237,7 @@ class _Table:
 
 
 def _distinct(tables: list[_Table], given: Iterable[N]) -> tuple[N, ...]:
-    """What tables are read as, if no two have one name."""
+    """Return the objects read from the tables; raise an error if two have the same name."""
     found: list[N] = []
     for table, one in zip(tables, given, strict=True):
         if one.name in [other.name for other in found]:
@@ -272,7 +272,7 @@ def _crowd(table: _Table, shared: dict[str, Any]) -> Crowd:
 
 
 def _threshold(table: _Table, names: dict[str, list[str]], sure: float, groups: int, compares: bool) -> Threshold:
-    """A threshold that some planner could keep with segments of so many groups."""
+    """Read a threshold, and check that a planner could keep it with so few or many groups of segments."""
     given, confidence = table.given, table.given.get("confidence", sure)
     if given["metric"] not in MEASURES:
         raise table.wrong("metric", f"unknown (known: {', '.join(MEASURES)})")

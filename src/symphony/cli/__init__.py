@@ -123,7 +123,7 @@ def _refuse_gone(args: Sequence[str]) -> None:
 
 
 def settle() -> None:
-    """Settings of a process that is ours alone, before it loads torch; those of the user take precedence."""
+    """Apply the settings of a process of our own before it loads torch; the user's settings take precedence."""
     allocator.tune()
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin take the cores of a busy machine
     cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
@@ -131,7 +131,7 @@ def settle() -> None:
 
 
 def guarded(action: Callable[[], object]) -> int:
-    """Run something; errors that a user can meet become one line and an exit status."""
+    """Run an action; turn errors that a user can meet into one line and an exit status."""
     ours = threading.current_thread() is threading.main_thread()  # others get no signals
     before = signal.signal(signal.SIGTERM, _terminate) if ours else None
     try:
@@ -155,13 +155,13 @@ def guarded(action: Callable[[], object]) -> int:
 
 
 def _terminate(number: int, frame: object) -> None:
-    """End the work as an interrupt does."""
+    """End the process as an interrupt does."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough: tidying up must not be cut short
     raise KeyboardInterrupt("terminated")
 
 
 def _warn(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
-    """Show our warnings in one line, those of libraries as they are."""
+    """Show our warnings in one line, and those of libraries unchanged."""
     if issubclass(category, errors.DataWarning):
         tell(f"symphony: warning: {message}")
     else:

@@ -1,4 +1,4 @@
-"""Learn agents, evaluate them against the log, build the paper's tables from that; the included agents, a demo."""
+"""Train agents, evaluate them against the log, build the paper's tables; show the included agents, run a demo."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ EXTRAS = "eclipse-sumo pyarrow ray imageio-ffmpeg gymnasium mcap"
 
 
 class Train(shared.Command):
-    """Learn agents from a store of run segments."""
+    """Train agents on a store of run segments."""
 
     config: Annotated[symphony.TrainConfig, arg(name="")]
     profile: Annotated[Profile, arg(help=WORDS)] = "default"
@@ -53,8 +53,8 @@ class Train(shared.Command):
 class Evaluate(shared.Simulation):
     """Simulate the interactive agents of every run segment and compare them with the log.
 
-    The log itself and agents at constant velocity are evaluated beside the agent. A run keeps what was found as
-    evaluations/NAME.json in its folder, where `symphony table` looks for it; --segments leaves the folder as it is.
+    The log itself and agents at constant velocity are evaluated beside the agent. A run keeps the results as
+    evaluations/NAME.json in its folder, where `symphony table` looks for them; --segments leaves the folder as it is.
     """
 
     json: shared.Json = None
@@ -126,8 +126,8 @@ class Evaluate(shared.Simulation):
 class Table(shared.Command):
     """Build one of the paper's tables from runs that `symphony evaluate` (or a recipe) has evaluated.
 
-    A row for each method there is (and each way that it was simulated in), mean and standard error over its seeds,
-    the best of the BC methods and of the MGAIL methods in bold. Runs of other settings are left out.
+    Each method (and each way in which it was simulated) has a row: mean and standard error over its seeds, the best
+    of the BC methods and of the MGAIL methods in bold. Runs of other settings are left out.
     """
 
     #: Setting of the table. `main`: 10 s, 2 interactive agents; `long`: 20 s, 2 agents; `many`: 10 s, 8 agents.
@@ -169,7 +169,7 @@ class Agents(shared.Command):
 class Demo(shared.Command):
     """Evaluate and draw an agent that comes with the package, on the built-in data: half a minute on a laptop.
 
-    Then learn another from the built-in data, some minutes, and show it beside the first.
+    Then train another on the built-in data, which takes some minutes, and show it beside the first.
     """
 
     out: Path = Path("out/demo")  # Folder for agent, pictures, numbers; an earlier demo there is replaced.
@@ -192,7 +192,7 @@ class Demo(shared.Command):
         clips: list[render.Clip] = []
 
         def show(agents: dict[str, str], picture: Path) -> None:
-            """Evaluate agents by their titles, and show them beside those before."""
+            """Evaluate agents by their titles, and show them beside the earlier ones."""
             for title, agent in agents.items():
                 kept: dict[int, Any] = {}
                 with shared.progress(f"evaluating {title}") as advance:
@@ -222,7 +222,7 @@ class Demo(shared.Command):
 
 
 class Doctor(shared.Command):
-    """Say what is installed, and simulate a second with an agent that comes with the package."""
+    """Show what is installed, and simulate a second with an agent that comes with the package."""
 
     json: shared.Json = None
 

@@ -1,4 +1,4 @@
-"""Convert or generate run segments into a store, and look into it."""
+"""Convert or generate run segments into a store, and inspect it."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ LISTS = {"path", "files", "settings", "reasons", "odd_examples", "skipped", "ski
 class Generate(shared.Command):
     """Make run segments with SUMO: random networks and traffic.
 
-    A run that was interrupted, in whatever way, is continued by the same command; a finished store is left as it
-    is. Equal arguments give equal stores (with the same version of SUMO), whatever the number of workers.
+    An interrupted run is continued by the same command; a finished store is left as it is. Equal arguments give equal
+    stores (with the same version of SUMO), whatever the number of workers.
     """
 
     out: Path  # Folder of the store; with a preset, of its stores `train`, `validation` and `test`.
@@ -112,7 +112,7 @@ class Hardest(shared.Command):
     """List the run segments of a store, or the rollouts in a folder, that are most critical for the ego.
 
     The hardest come first. Four things make one critical, each with up to one point: a short time to collision, a
-    short time between the ego and another who crosses its way, hard braking, a small distance to the road's boundary.
+    short time between the ego and another that crosses its path, hard braking, a small distance to the road boundary.
     """
 
     store: Annotated[Positional[Path], arg(metavar="DIR")]  # Folder of the store, or of rollouts.
@@ -193,10 +193,10 @@ class Convert(shared.Command):
 
 
 class Prepare(shared.Command):
-    """Fit the vehicles of a store beforehand, so that `symphony train` has no such work.
+    """Fit actions to the vehicles of a store in advance, so that `symphony train` need not do it.
 
-    What was prepared is kept in the store's folder `experts`; a preparation that was interrupted is continued by the
-    same command, and equal arguments give equal files, whatever the number of workers.
+    The results are kept in the store's folder `experts`; an interrupted preparation is continued by the same command,
+    and equal arguments give equal files, whatever the number of workers.
     """
 
     store: shared.Store
@@ -221,7 +221,7 @@ class Prepare(shared.Command):
 
 
 class Merge(shared.Command):
-    """Copy the run segments of several stores into a new one, to learn from all of them."""
+    """Copy the run segments of several stores into a new one, to train on all of them."""
 
     #: Folders of the stores; they must have the same time step and no run segment in common.
     stores: Annotated[Positional[shared.Paths], arg(metavar="DIR ...")]
@@ -236,7 +236,7 @@ class Merge(shared.Command):
 
 
 class Info(shared.Command):
-    """Say what a store of run segments holds; the JSON also lists skipped records and who is interactive where."""
+    """Show what a store of run segments holds; the JSON also lists skipped records and the interactive agents."""
 
     store: shared.Store
     json: shared.Json = None

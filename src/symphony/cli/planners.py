@@ -1,4 +1,4 @@
-"""Compare planners among crowds, test them against thresholds, estimate how often they fail where that is rare."""
+"""Compare planners among crowds, test them against thresholds, estimate how often they fail if that is rare."""
 
 from __future__ import annotations
 

@@ -19,8 +19,8 @@ Runs = Annotated[Positional[shared.Paths], Bounds(distinct=True), arg(metavar="R
 class Curvature(shared.Command):
     """Draw how often the policy, and the log, visit branching regions of each average curvature.
 
-    A panel for each run (or `pretrained:NAME`), from what `symphony evaluate` found; left turns are positive (in the
-    paper, right turns).
+    Each run (or `pretrained:NAME`) has a panel, from the results of `symphony evaluate`; left turns are positive (in
+    the paper, right turns).
     """
 
     runs: Runs
@@ -68,7 +68,7 @@ class Curves(shared.Command):
 
 
 class Segment(shared.Command):
-    """Draw a run segment: map, lights and agents, with the tracks of the whole window."""
+    """Draw a run segment: map, lights and agents, with the tracks of the whole log."""
 
     store: shared.Store
     segment: str  # Id of the run segment, or its number in the store.
@@ -93,7 +93,7 @@ class Segment(shared.Command):
 class Routes(shared.Command):
     """Draw the feasible routes of agents on the map, and mark the one that each took.
 
-    A panel for each interactive agent of each run segment; by default of three segments, spread over the store.
+    One panel shows one interactive agent of a run segment; by default of three segments, spread over the store.
     """
 
     data: Path  # Store of run segments.

@@ -1,4 +1,4 @@
-"""What recipes do as scripts: train, evaluate beside the baselines, keep the numbers."""
+"""Recipes as scripts: train, evaluate beside the baselines, keep the numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulate agents, and look at the rollouts, evaluate them one by one, hand them to other tools."""
+"""Simulate agents; view the rollouts, evaluate them one by one, export them to other tools."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from symphony.config import EvaluateConfig, checks, evaluation
 class Simulate(shared.Simulation):
     """Simulate the interactive agents of every run segment and keep the rollouts.
 
-    An interrupted simulation is continued by the same command. See them with `symphony view`, evaluate them with
-    `symphony report`, hand them on with `symphony export`.
+    An interrupted simulation is continued by the same command. View them with `symphony view`, evaluate them with
+    `symphony report`, pass them on with `symphony export`.
     """
 
     out: Path  # Folder of the rollouts.
@@ -83,7 +83,7 @@ class View(shared.Command):
     """Make a page that plays saved rollouts: it opens from disk in any browser, without a network.
 
     Several folders play side by side, with metrics over time below; rollouts can be chosen by their events, plans and
-    branches of a search are drawn. With --out a picture or a film instead, by default of the first few run segments.
+    branches of a search are drawn. With --out, make a picture or a film instead, by default of the first segments.
     """
 
     folders: shared.SavedFolders
@@ -120,7 +120,7 @@ class View(shared.Command):
 
 
 def write_view(folders: list[Any], reports: list[Any], out: Path) -> None:
-    """Write the page that plays the rollouts of folders, with what the reports of them found marked in it."""
+    """Write the page that plays the rollouts of folders, with the findings of their reports marked in it."""
     from symphony.render.viewer import view_page
 
     pairs, several = list(zip(folders, reports, strict=True)), len(folders) > 1
@@ -131,7 +131,7 @@ def write_view(folders: list[Any], reports: list[Any], out: Path) -> None:
 
 
 class Report(shared.Command):
-    """Report what happened in saved rollouts: collisions and whose fault, red lights, progress, comfort and more.
+    """Report what happened in saved rollouts: collisions and whose fault they were, red lights, progress, comfort.
 
     Writes report.html (one page, worst runs first, each a click away from its replay), report.json and report.csv.
     """
@@ -170,7 +170,7 @@ class Report(shared.Command):
 
 
 class Export(shared.Command):
-    """Write saved rollouts in a format of other tools, a file for each."""
+    """Write saved rollouts in a format of other tools, one file each."""
 
     folder: shared.Saved
     #: Format: CommonRoad scenarios (XML 2020a), JSON, OpenSCENARIO (XML 1.2), or MCAP for Foxglove (extra `mcap`).

@@ -1,4 +1,4 @@
-"""What commands share: options, run segments by name, progress, results on the terminal and as JSON."""
+"""The shared parts of commands: options, run segments by name, progress, results on the terminal and as JSON."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Command:
 
 
 class Simulation(Command):
-    """An agent on run segments."""
+    """The options of a simulation: an agent on run segments."""
 
     #: Folder of a run (see `symphony train`), `pretrained:NAME` (an agent of the package), `playback` (the log
     #: itself), `constant_velocity` or `idm` (the intelligent driver model, along the route of the log).
@@ -62,7 +62,7 @@ class Simulation(Command):
 
 
 def segment_indices(store: symphony.SegmentStore, names: Sequence[str]) -> list[int]:
-    """The places in a store of some run segments, each named once by its id or its number, or an error."""
+    """Return the places of run segments in a store; each must be named once, by its id or its number."""
     found: dict[int, str] = {}
     for name in names:
         place = store.index_of(int(name) if name not in store.ids and name.isdecimal() else name)
@@ -74,7 +74,7 @@ def segment_indices(store: symphony.SegmentStore, names: Sequence[str]) -> list[
 
 @contextmanager
 def progress(description: str, unit: str = "segments") -> Iterator[Callable[..., None]]:
-    """A progress bar on standard error; gives a function of how much is done, the total, and maybe a note."""
+    """Show a progress bar on standard error; yield a function of the number done, the total, and an optional note."""
     from rich.console import Console
     from rich.markup import escape
     from rich.progress import Progress, TextColumn
@@ -95,12 +95,12 @@ def say(text: str) -> None:
 
 
 def tell(text: str) -> None:
-    """Print a line beside the results, on standard error."""
+    """Print a line on standard error, apart from the results."""
     sys.stderr.write(f"{errors.printable(text)}\n")
 
 
 def write_numbers(path: Path | None, numbers: Any) -> bool:
-    """Write numbers as JSON to a file, or to standard output where it is called -; otherwise True: print a text."""
+    """Write numbers as JSON to a file, or to standard output for -; return whether a text may still be printed."""
     if str(path) == "-":
         sys.stdout.write(files.json_text(numbers))
     elif path is not None:
@@ -160,7 +160,7 @@ COLUMNS = (
 
 
 def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, details: bool = False) -> None:
-    """Print records of agents as one table and a line of what they are of; with details, all of their numbers."""
+    """Print records of agents as one table and a line that says what they are of; with details, all their numbers."""
     heads = ["agent\n", *(heading for _, heading, _ in COLUMNS)]
     table = [[heading.split("\n")[k] for heading in heads] for k in range(2)]
     named = [{**row, "agent": short_name(str(row["agent"]))} for row in rows]
@@ -182,12 +182,12 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, details: b
 
 
 def short_name(agent: str) -> str:
-    """An agent's name as tables show it, or that of a planner among agents: the names of folders alone."""
+    """Return an agent's name as tables show it, or that of a planner among agents: the folders' names alone."""
     return " among ".join(part.rpartition("/")[2] or part for part in agent.split(" among "))
 
 
 def number_cell(value: float | None, error: float | None, digits: int, bound: float | None = None) -> str:
-    """A number with its standard error, or zero with a bound that is known; a dash for none."""
+    """Return a number with its standard error, or zero with a known bound; a dash if there is no number."""
     if value is None or math.isnan(value):
         return "–"
     text = f"{value:.{digits}f}"

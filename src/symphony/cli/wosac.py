@@ -1,4 +1,4 @@
-"""Score rollouts as the Waymo Open Sim Agents Challenge does, make and check a submission to it."""
+"""Score rollouts as the Waymo Open Sim Agents Challenge does; make and check a submission to it."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Evaluate(shared.Command):
     """Simulate 32 rollouts of every run segment and score them, beside those of baselines.
 
     The agent drives all vehicles but those that stand with no green light ahead, which stay; pedestrians and cyclists
-    keep about their velocity. Standard errors are over recordings.
+    roughly keep their velocity. Standard errors are over recordings.
     """
 
     agent: Agent
@@ -90,8 +90,8 @@ class Evaluate(shared.Command):
 class Submit(shared.Command):
     """Simulate 32 rollouts of every scenario of the Waymo Open Motion Dataset and write them as a submission.
 
-    The agent drives what it drives in `symphony wosac evaluate`. What happens after the current step of a scenario is
-    not looked at, so scenarios of the test set can be simulated. See docs/wosac.md.
+    The agent drives the same objects as in `symphony wosac evaluate`. Nothing after the current step of a scenario is
+    read, so scenarios of the test set can be simulated. See docs/wosac.md.
     """
 
     agent: Agent

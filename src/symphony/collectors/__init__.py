@@ -1,7 +1,7 @@
 """Beam search over simulated futures, and backtracking in them, as a function, a TorchRL collector and a planner.
 
-Works with environments that keep all of their state in the TensorDict, whatever they simulate; not with those that
-wrap a simulator of its own (GymEnv, VmasEnv) or run in other processes (ParallelEnv).
+They work with environments that keep all of their state in the TensorDict, whatever they simulate; not with those
+that wrap a simulator of their own (GymEnv, VmasEnv) or run in other processes (ParallelEnv).
 """
 
 from __future__ import annotations

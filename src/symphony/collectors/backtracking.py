@@ -26,9 +26,9 @@ Renew = Callable[[TensorDictBase, Tensor], TensorDictBase]
 class Backtrack:
     """Rule of :func:`symphony.collectors.beam_search`: branches are lines that go back where they are bad.
 
-    A line is bad that ends a period with a total above the threshold, or NaN. The first time it goes back `back[0]`
+    A line is bad if it ends a period with a total above the threshold, or NaN. The first time it goes back `back[0]`
     periods from there; if it is bad again before it has come `back[0]` good periods past that place `back[1]`, and so
-    on, and then the last of them again and again. Once it was simulated `cap` times over, it goes on as it is.
+    on, and then the last of them again and again. Once it has been simulated `cap` times over, it goes on as it is.
 
     Args:
         threshold: in the units of the totals.
@@ -56,7 +56,7 @@ class Backtrack:
 
 
 class Course:
-    """The next period `at` of each line [M], and how often it has gone back, its `times`."""
+    """The next period `at` of each line [M], and how often it has gone back, `times`."""
 
     def __init__(self, rule: Backtrack, lines: int, periods: int, device: torch.device) -> None:
         self.rule, self.periods = rule, periods
@@ -67,7 +67,7 @@ class Course:
         )
 
     def judge(self, line: Int[Tensor, " R"], bad: Bool[Tensor, " R"]) -> Bool[Tensor, " R"]:
-        """Move lines to their next periods by whether the one they ended was bad; True for those that go back."""
+        """Move lines to their next periods, given whether the period they ended was bad; return which go back."""
         at, tries, front = self.at[line], self.tries[line], self.front[line]
         goes = bad & (self.again[line] < self.rule.cap * self.periods)
         back = self.back[tries.clamp_max(len(self.back) - 1)]
@@ -83,8 +83,8 @@ class Course:
 
 class Run(NamedTuple):
     """A period of branches [*b, S] (of lines [R, 1]) as simulated: the kept entries of its steps, their scores, which
-    are 0 after the end of an episode, the steps before (and with) the end of that of each agent, or of all (K = 1),
-    whose have ended, and the last states.
+    are 0 after the end of an episode, which steps came before (or were) the end of each agent's episode, or of all
+    agents' (K = 1), which episodes have ended, and the last states.
     """
 
     records: list[TensorDictBase]
@@ -104,7 +104,7 @@ def follow(
     steps: int,
     every: int,
 ) -> tuple[TensorDictBase, Tensor, Tensor, Tensor, int]:
-    """Simulate lines [*b, S] until all have come to their ends.
+    """Simulate lines [*b, S] until all have ended.
 
     Returns their kept entries and scores [*b, S, T, N], which steps counted [*b, S, T], totals [*b, P, S], and how
     many line-steps were simulated, those that were done again included.
@@ -170,7 +170,7 @@ def follow(
 def _with_rows(
     state: TensorDictBase, rows: Int[Tensor, " K"], other: TensorDictBase, entries: Sequence[NestedKey]
 ) -> TensorDictBase:
-    """A state [R, 1] of which some rows are another's [K, 1]."""
+    """Return a state [R, 1] in which some rows are replaced by another's [K, 1]."""
     for key in entries:
         value = other.get(key, None)
         if value is None:

@@ -39,7 +39,7 @@ PROGRAMS = 64
 
 @dataclass(frozen=True)
 class BeamSearchResult:
-    """What a search found: *b rows, S branches, L leaves, T steps in P periods, N agents.
+    """The result of a search: *b rows, S branches, L leaves, T steps in P periods, N agents.
 
     A *leaf* is what a slot holds at the end; its history was simulated in other slots before each fork. All S
     leaves come in the order of their slots: with :class:`KeepBest`, slot 0 holds the best of the last period.
@@ -90,7 +90,7 @@ class BeamSearchResult:
 
     @property
     def descendants(self) -> Int[Tensor, "*b P S"]:
-        """How many of the leaves have what a slot simulated in a period in their history."""
+        """The number of leaves whose history contains what a slot simulated in a period."""
         return torch.zeros_like(self.parents).scatter_add(-1, self.slots, torch.ones_like(self.slots))
 
 
@@ -117,13 +117,13 @@ def beam_search(
     compile_step: bool | Mapping[str, Any] = False,
     exploration_type: ExplorationType | None = ExplorationType.RANDOM,
 ) -> BeamSearchResult:
-    """Search an environment whose whole state is in the TensorDict: those with high scores of the S branches of each
-    row make room for copies of the others.
+    """Search an environment whose whole state is in the TensorDict: of the S branches of each row, those with high
+    scores are replaced by copies of the others.
 
-    Gradients flow through environment, policy and scores unless the caller turns them off, along the history of
-    each leaf; no tensor is changed in place. An episode ends once, with the first ``done`` (terminated or truncated):
-    its branch is simulated on, since all have one length, but later steps have a score of 0, count in no maximum or
-    mean, and rows whose branches have all ended are pruned no more.
+    Gradients flow through environment, policy and scores unless the caller turns them off, along the history of each
+    leaf; no tensor is changed in place. An episode ends once, with the first ``done`` (terminated or truncated): its
+    branch is still simulated, since all have one length, but later steps have a score of 0, count in no maximum or
+    mean, and rows whose branches have all ended are no longer pruned.
 
     Args:
         env: can be branched, see :func:`check_branching`. Its transforms are applied to the branches.
@@ -150,7 +150,7 @@ def beam_search(
             copy is of its parent's group.
         keep: entries kept of each step, e.g. ``[("next", "agents", "state")]``; default all.
         keep_tree: also return the branches that were pruned.
-        leaves: return only so many, the best by their `leaf_costs` first; default all, in the order of their slots.
+        leaves: how many to return, the best by their `leaf_costs` first; default all, in the order of their slots.
         compile_step: compile policy, environment and score of a step as one program, or how, as
             :func:`torch.compile` takes it.
         exploration_type: under which the policy runs.
@@ -239,7 +239,7 @@ def beam_search(
 def _independent(
     lines: tuple[TensorDictBase, Tensor, Tensor, Tensor, int], prune_every: int, keep_tree: bool
 ) -> BeamSearchResult:
-    """Lines as the leaves of a search in which every branch goes on from itself."""
+    """Return lines as the leaves of a search in which every branch continues itself."""
     steps, scores, alive, totals, simulated = lines
     slots = torch.arange(totals.shape[-1], device=totals.device).expand(totals.shape)
     steps.refine_names(..., "time")
@@ -265,7 +265,7 @@ class Simulation:
     width: int = 0  # lines that are simulated at a time, the last again where there are fewer
 
     def run(self, now: TensorDictBase, ended: Bool[Tensor, "*b S K"], length: int) -> Run:
-        """A period of some steps."""
+        """Simulate a period of some steps."""
         if len(now) < self.width:
             lines = torch.arange(self.width, device=ended.device).clamp_max(len(now) - 1)[:, None]
             found = self.run(take(now, lines), take_values(ended, lines, 2), length)
@@ -292,7 +292,7 @@ class Simulation:
         return Run(records, torch.where(alive, joined, 0.0), alive, over[..., -1, :], now)
 
     def total(self, run: Run, length: int | None = None) -> Float[Tensor, "*b S"]:
-        """The totals of a period, or of its first steps alone."""
+        """Return the totals of a period, or of its first steps alone."""
         scores, alive = run.scores[..., :length, :], run.alive[..., :length, :]
         weighs = self.aggregate if isinstance(self.aggregate, Aggregate) else None
         found = self.aggregate(scores) if weighs is None else weighs(scores, alive)
@@ -304,7 +304,7 @@ class Simulation:
 def _step(
     env: EnvBase, policy: Policy, score: Score, keep: Sequence[NestedKey] | None, now: TensorDictBase
 ) -> tuple[TensorDictBase, TensorDictBase, Float[Tensor, "*b S N"], Bool[Tensor, "*b S K"]]:
-    """What is kept of a step, the next state, its scores, and where the episode ended; one program if compiled."""
+    """Return a step's kept entries, next state, scores, and which episodes ended; one program if compiled."""
     stepped = env.step(policy(now))
     now = env.step_mdp(stepped)
     seen = now.copy()  # the reward is shown to the score, but is no part of the next step's input
@@ -336,7 +336,7 @@ def _compiled(env: EnvBase, how: bool | Mapping[str, Any]) -> Callable[..., Any]
 
 
 def _ordered(state: TensorDictBase, like: TensorDictBase) -> TensorDictBase:
-    """The entries in the order of the first state and no views: anything else would be compiled anew."""
+    """Return the entries in the order of the first state and without views: anything else would be compiled again."""
     entries = {}
     for key in sorted(state.keys(), key=[*like.keys(), *state.keys()].index):
         value = state.get(key)
@@ -349,7 +349,7 @@ def _ordered(state: TensorDictBase, like: TensorDictBase) -> TensorDictBase:
 
 
 def _ended(env: EnvBase, state: TensorDictBase, batch: int) -> Bool[Tensor, "*b S K"]:
-    """Whether the episode is done, for each of K agents where they end apart and for all (K = 1) where together."""
+    """Return whether the episode is done, for each of K agents if they end separately, else for all (K = 1)."""
     names = [below(key)[1:] for key in env.done_keys if last_name(key) == "done"]
     # As TorchRL has it, the end of a group is that of all that is nested in it.
     outer = [n for n in names if not any(len(o) < len(n) and n[: len(o) - 1] == o[:-1] for o in names)]
@@ -362,13 +362,13 @@ def _ended(env: EnvBase, state: TensorDictBase, batch: int) -> Bool[Tensor, "*b 
 
 
 def _places(slots: Int[Tensor, "*b _"], start: TensorDictBase) -> Int[Tensor, "*b _"]:
-    """The places of slots [*b, L] or [*b, P, L] in the flattened branches [*b, S]."""
+    """Return the places of slots [*b, L] or [*b, P, L] in the flattened branches [*b, S]."""
     first = torch.arange(0, start.numel(), start.shape[-1], device=slots.device)
     return first.reshape(*start.shape[:-1], *(1,) * (slots.ndim - start.ndim + 1)) + slots
 
 
 def lineage(parents: Int[Tensor, "*b P S"]) -> Int[Tensor, "*b P S"]:
-    """The slot that held, during each of the P periods, what each of the S slots holds after the last pruning."""
+    """Return the slot that held, in each of the P periods, what each of the S slots holds after the last pruning."""
     slots = [parents[..., -1, :]]
     for period in reversed(range(parents.shape[-2] - 1)):
         slots.append(parents[..., period, :].gather(-1, slots[-1]))
@@ -376,7 +376,7 @@ def lineage(parents: Int[Tensor, "*b P S"]) -> Int[Tensor, "*b P S"]:
 
 
 def ranking(costs: Float[Tensor, "*b L"], slots: Int[Tensor, "*b L"]) -> Int[Tensor, "*b L"]:
-    """Leaves from best to worst by their costs, repeated copies of one slot after all others."""
+    """Return leaves from best to worst by their costs, repeated copies of one slot after all others."""
     # Two stable sorts: by cost, then by how many copies of the same history come before.
     copies = (slots[..., :, None] == slots[..., None, :]).tril(-1).sum(-1)
     order = costs.argsort(dim=-1, stable=True)

@@ -1,4 +1,4 @@
-"""Environments in several copies: which can be branched, in which batch shape they are, and rows of their states."""
+"""Environments in several copies: which ones can be branched, their batch shapes, and rows of their states."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _PASSED: WeakSet[EnvBase] = WeakSet()
 
 
 def branch(tensordict: TensorDictBase, branches: int) -> TensorDictBase:
-    """[*b] to [*b, S]: S views of each row, to start a search from."""
+    """Expand [*b] to [*b, S]: S views of each row, to start a search from."""
     return tensordict.unsqueeze(-1).expand(*tensordict.batch_size, branches)
 
 
@@ -75,13 +75,13 @@ class BatchedEnv(EnvBase):
         self.inner._set_seed(seed)
 
     def to(self, device: torch.device | str | int) -> BatchedEnv:
-        """Move the environment, too."""
+        """Move this view and its environment to a device."""
         self.inner = self.inner.to(device)
         return super().to(device)
 
 
 def _expanded(spec: Composite, own: torch.Size, shape: torch.Size) -> Composite:
-    """A spec of batch size `own` with the batch size `shape`, which begins with `own`."""
+    """Return a spec of batch size `own` with the batch size `shape`, which begins with `own`."""
     if spec.shape != own:
         spec = spec.clone()
         spec.shape = own
@@ -91,7 +91,7 @@ def _expanded(spec: Composite, own: torch.Size, shape: torch.Size) -> Composite:
 
 
 def with_rows(env: EnvBase, batch_size: Sequence[int]) -> TransformedEnv:
-    """Give an environment that accepts any batch shape a fixed one, each row with a start of its own.
+    """Give an environment that accepts any batch shape a fixed one, each row with its own start.
 
     Transforms of the environment are applied to the batch; others may be appended. (A bare
     ``BatchSizeTransform(batch_size=...)`` resets once and starts all rows from the same state.)
@@ -103,7 +103,7 @@ def with_rows(env: EnvBase, batch_size: Sequence[int]) -> TransformedEnv:
 
 
 def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> EnvBase:
-    """The environment for states of a batch shape, its transforms included; ValueError if it can't be branched.
+    """Return the environment for states of a batch shape, with its transforms; ValueError if it can't be branched.
 
     Args:
         env: with rows [*b], or for any batch shape.
@@ -130,7 +130,7 @@ def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> E
 
 
 def parts_of(env: EnvBase) -> tuple[EnvBase, list[Transform]]:
-    """The innermost environment and the transforms around it, those that only give it a batch size left out."""
+    """Return the innermost environment and the transforms around it, except those that only give it a batch size."""
     transforms: list[Transform] = []
     while isinstance(env, TransformedEnv):
         transforms = [*_flat(env.transform), *transforms]
@@ -160,7 +160,7 @@ def _check_transform(transform: Transform, later: Sequence[Transform]) -> None:
 
 
 def recall(env: EnvBase, state: TensorDictBase) -> None:
-    """Let transforms that keep frames of their own go on from those in a state."""
+    """Let transforms that keep frames of their own continue from those in a state."""
     for transform in parts_of(env)[1]:
         if isinstance(transform, CatFrames):
             for into, key in zip(transform.in_keys, transform.out_keys, strict=True):
@@ -184,12 +184,12 @@ def branched_specs(policy: Any, own: torch.Size, shape: torch.Size) -> Iterator[
 
 
 def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:
-    """Refuse an environment that keeps anything outside of the TensorDict: copies of its branches would share it.
+    """Refuse an environment that keeps anything outside the TensorDict: copies of its branches would share it.
 
     It must accept any batch shape, or any that begins with its own, which rules out GymEnv, VmasEnv, SerialEnv,
     ParallelEnv and whatever wraps a simulator of its own; random numbers of its own are allowed. Given a state, it is
     also stepped from it twice by the same random numbers, once in its lifetime: if the results differ, it remembers
-    something. One whose class says ``branchable = True`` is spared that trial, which waits for the device.
+    something. One whose class says ``branchable = True`` skips that trial, which waits for the device.
 
     Raises ValueError if it can't be branched.
     """
@@ -224,7 +224,7 @@ def _refusal(env: EnvBase, why: str) -> ValueError:
 
 @contextmanager
 def _same_numbers(env: EnvBase) -> Iterator[None]:
-    """Put back the generators, the global ones and the environment's, as if nothing had been drawn."""
+    """Restore the global random generators and the environment's, as if nothing had been drawn."""
     held = [value for part in env.modules() for value in vars(part).values()]
     own = [value for value in held if isinstance(value, torch.Generator)]
     states = [generator.get_state() for generator in own]
@@ -235,7 +235,7 @@ def _same_numbers(env: EnvBase) -> Iterator[None]:
 
 
 def take(tensordict: TensorDictBase, rows: Int[Tensor, "*c"], dims: int | None = None) -> TensorDictBase:
-    """Rows of the flattened batch, or of its first `dims` dimensions, in a batch of the shape of `rows`."""
+    """Return rows of the flattened batch, or of its first `dims` dimensions, in a batch of the shape of `rows`."""
     dims = tensordict.batch_dims if dims is None else dims
     taken = {
         key: take(value, rows, dims) if isinstance(value, TensorDictBase) else take_values(value, rows, dims)
@@ -245,17 +245,17 @@ def take(tensordict: TensorDictBase, rows: Int[Tensor, "*c"], dims: int | None =
 
 
 def take_values(values: Shaped[Tensor, "*_"], rows: Int[Tensor, "*c"], dims: int) -> Shaped[Tensor, "*_"]:
-    """Rows of the first `dims` dimensions, flattened, in the shape of `rows`."""
+    """Return rows of the first `dims` dimensions, flattened, in the shape of `rows`."""
     # index_select on whole rows is many times faster than gather or advanced indexing on wide entries.
     taken = values.flatten(0, dims - 1).index_select(0, rows.flatten())
     return taken.reshape(*rows.shape, *values.shape[dims:])
 
 
 def below(key: NestedKey) -> tuple[str, ...]:
-    """The key under ``"next"``."""
+    """Return the key under ``"next"``."""
     return unravel_key(("next", key))
 
 
 def last_name(key: NestedKey) -> str:
-    """The last part of a key."""
+    """Return the last part of a key."""
     return key if isinstance(key, str) else key[-1]

@@ -26,8 +26,8 @@ class BeamSearchCollector(Collector):
     """Collects beam searches of an environment that keeps its whole state in the TensorDict: see :func:`beam_search`.
 
     Every batch starts from a reset: [*env.batch_size, T] with the best leaf of each row, or [*env.batch_size, L, T]
-    with the L best. Everything else is :class:`torchrl.collectors.Collector`: replay buffers, weight updates, hooks,
-    state, and being run by ``MultiSyncCollector`` or ``RayCollector``, see :meth:`bind`.
+    with the L best. Everything else is as in :class:`torchrl.collectors.Collector`: replay buffers, weight updates,
+    hooks, state, and being run by ``MultiSyncCollector`` or ``RayCollector``, see :meth:`bind`.
 
     Besides the usual entries a batch holds
 
@@ -37,8 +37,8 @@ class BeamSearchCollector(Collector):
     - ``("collector", "mask")`` [..., T] bool: False after the end of an episode; TorchRL's losses leave such steps
       out. With ``trajs_per_batch`` they are dropped.
     - with a :class:`Resampling` rule, ``("collector", "log_weight")`` [..., T]: of the leaf, relative to the mean
-      weight of its tree. Losses may weigh leaves by its exponential.
-    - with `keep_tree`, ``"tree"``, a TensorDict [*env.batch_size, S, T] of all that was simulated, by slot, pruned
+      weight of its tree. Losses may weight leaves by its exponential.
+    - with `keep_tree`, ``"tree"``, a TensorDict [*env.batch_size, S, T] of all simulated steps, by slot, pruned
       branches included, with their ``("collector", "beam_score")``.
 
     Args:
@@ -48,7 +48,7 @@ class BeamSearchCollector(Collector):
         branches: S.
         leaves: L; by default the best leaf alone, without a dimension of its own.
         prepare: called on the branched start state [*env.batch_size, S], e.g. to give each branch a group.
-        keep_tree: also return what was pruned; with ``leaves=branches`` only.
+        keep_tree: also return the pruned branches; with ``leaves=branches`` only.
         rule_noise: ``rule_noise(start, periods)`` gives numbers in [0, 1) for rules that draw, as `noise` of
             :func:`beam_search`; by default from a generator that :meth:`set_seed` sets.
         prune_every, rule, aggregate, value, accumulate, prune_last, until_done, slot_keys, group_key, keep,
@@ -113,7 +113,7 @@ class BeamSearchCollector(Collector):
 
     @classmethod
     def bind(cls, **settings: Any) -> type[Collector]:
-        """A subclass with arguments given, for collectors that make collectors in other processes.
+        """Return a subclass with arguments given, for collectors that make collectors in other processes.
 
         ``MultiSyncCollector(..., collector_class=BeamSearchCollector.bind(score=score, branches=16))``; without a
         replay buffer also ``use_buffers=False, cat_results="stack"``. The arguments must be picklable. A network on
@@ -123,7 +123,7 @@ class BeamSearchCollector(Collector):
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
-        """One search from a reset: the leaves, [*env.batch_size, T] or [*env.batch_size, L, T]."""
+        """Return the leaves of one search from a reset, [*env.batch_size, T] or [*env.batch_size, L, T]."""
         if self.pre_collect_hook is not None:
             self.pre_collect_hook()
         found = self._searched(self.env.reset())
@@ -176,7 +176,7 @@ class BeamSearchCollector(Collector):
         return leaves
 
     def _truncate(self, leaves: TensorDictBase) -> TensorDictBase:
-        """Declare the last step truncated, if asked for."""
+        """Declare the last step truncated, if the collector is to."""
         last = torch.arange(leaves.shape[-1]) == leaves.shape[-1] - 1
         last = last.to(leaves.get(("collector", "mask")).device).expand(leaves.shape)
         for key in self._done if self.set_truncated else ():
@@ -186,7 +186,7 @@ class BeamSearchCollector(Collector):
         return leaves
 
     def _acting(self) -> Policy:
-        """The policy of one search; until `init_random_frames` are collected, random actions."""
+        """Return the policy of one search; random actions until `init_random_frames` are collected."""
         buffer, policy = self.replay_buffer, self._wrapped_policy
         seen = self.stats()["frames"] if buffer is None else buffer.write_count
         if isinstance(policy, RandomPolicy) or seen < (self.init_random_frames or 0):
@@ -204,7 +204,7 @@ class BeamSearchCollector(Collector):
         return elsewhere
 
     def rule_noise(self, start: TensorDictBase) -> Float[Tensor, "*_"]:
-        """Numbers in [0, 1) for the pruning rule [*env.batch_size, P] (or [..., P, S]), from a branched start."""
+        """Return numbers in [0, 1) for the pruning rule [*env.batch_size, P] (or [..., P, S]), given the start."""
         periods = -(-self.frames_per_batch // self.prune_every)
         if self._rule_noise is not None:
             return self._rule_noise(start, periods)
@@ -212,13 +212,13 @@ class BeamSearchCollector(Collector):
         return torch.rand((*start.shape[:-1], periods, *slots), generator=self._rng).to(self.env_device)
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
-        """Seed the environment and the noise of the pruning rule; returns the next seed."""
+        """Seed the environment and the noise of the pruning rule; return the next seed."""
         self._rng.manual_seed(seed)
         return super().set_seed(seed, static_seed)
 
     @torch.no_grad()
     def fake_tensordict(self) -> TensorDictBase:
-        """Zeros in the shape and with the entries of a batch."""
+        """Return zeros in the shape and with the entries of a batch."""
         rng = self._rng.get_state()
         start = self.env.fake_tensordict().exclude("next", *self.env.action_keys)
         with torch.random.fork_rng([]):
@@ -229,13 +229,13 @@ class BeamSearchCollector(Collector):
         return self._truncate(batch.apply(torch.zeros_like))
 
     def state_dict(self) -> OrderedDict:
-        """State of the collector (policy, environment, counters) and of the search."""
+        """Return state of the collector (policy, environment, counters) and of the search."""
         state = super().state_dict()
         state["beam_search"] = {"simulated_frames": self.simulated_frames, "rng": self._rng.get_state()}
         return state
 
     def load_state_dict(self, state_dict: OrderedDict, **kwargs: Any) -> None:
-        """Load what :meth:`state_dict` returned; that of a plain collector will do."""
+        """Load what :meth:`state_dict` returned; that of a plain collector works as well."""
         super().load_state_dict(state_dict, **kwargs)
         search = state_dict.get("beam_search")
         if search is not None:
@@ -243,18 +243,18 @@ class BeamSearchCollector(Collector):
             self._rng.set_state(search["rng"])
 
     def stats(self) -> dict[str, int | float | bool]:
-        """Progress in numbers; see :class:`Collector`."""
+        """Return the progress in numbers; see :class:`Collector`."""
         return {**super().stats(), "simulated_frames": self.simulated_frames}
 
 
 class BoundType(type(Collector)):  # type: ignore[misc]  # TorchRL's metaclass has no public name
-    """Type of classes made at run time, which are pickled as their base and the arguments bound."""
+    """The type of classes made at run time, which are pickled as their base and the bound arguments."""
 
     settings: dict[str, Any]
 
 
 def bind(base: type[Collector], settings: dict[str, Any]) -> type[Collector]:
-    """A subclass with arguments given; those of a call take precedence."""
+    """Return a subclass with arguments given; those of a call take precedence."""
 
     def __init__(self: Any, create_env_fn: Any, policy: Any = None, **kwargs: Any) -> None:  # noqa: N807
         base.__init__(self, create_env_fn, policy, **{**settings, **kwargs})

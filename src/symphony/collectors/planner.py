@@ -1,4 +1,4 @@
-"""The beam search as a planner: an action for now, from the best of some simulated futures."""
+"""The beam search as a planner: the next action, from the best of several simulated futures."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from symphony.collectors.rules import Aggregate, KeepBest, KeyScore, PruningRule
 class BeamSearchPlanner(MPCPlannerBase):
     """Plans as :class:`torchrl.modules.CEMPlanner` does, by a beam search for a high return.
 
-    Branches are pruned by the rewards since the root and, where there is a value network, the value of the state they
-    have come to. The action is the first of the best branch. Beside it the planner writes targets for a policy, as
-    mctx gives them: ``("planner", "action")`` [*b, S, ...], the first actions of all branches; ``("planner",
-    "weight")`` [*b, S], the share of the final branches that go back to each, by ``softmax(return / temperature)``;
+    Branches are pruned by the rewards since the root and, where there is a value network, the value of the state that
+    they have reached. The action is the first of the best branch. Beside it the planner writes targets for a policy,
+    as mctx gives them: ``("planner", "action")`` [*b, S, ...], the first actions of all branches; ``("planner",
+    "weight")`` [*b, S], the share of the final branches that descend from each, by ``softmax(return / temperature)``;
     ``("planner", "value")`` [*b, 1], the return of the best branch.
 
     Args:
@@ -63,7 +63,7 @@ class BeamSearchPlanner(MPCPlannerBase):
 
     @torch.no_grad()
     def planning(self, tensordict: TensorDictBase) -> Tensor:
-        """The first action of the best branch from states [*b]; the targets are written into them."""
+        """Return the first action of the best branch from states [*b]; the targets are written into them."""
         root = tensordict.exclude("planner", "next", *self.env.action_keys)
         start, periods = branch(root, self.branches), -(-self.planning_horizon // self.prune_every)
         found = beam_search(

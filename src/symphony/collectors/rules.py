@@ -1,4 +1,4 @@
-"""What decides in a search: scores of steps, totals of periods, and rules by which branches go on in some copies."""
+"""The decisions of a search: scores of steps, totals of periods, and rules for which branches are copied."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _sum(values: Float[Tensor, "*_"], dim: int) -> Float[Tensor, "*_"]:
 
 @dataclass(frozen=True)
 class Aggregate:
-    """Scores of a period [*b, S, T_p, N] to totals [*b, S]: first over time, then over agents.
+    """Aggregates the scores of a period [*b, S, T_p, N] to totals [*b, S]: first over time, then over agents.
 
     Args:
         time: how the T_p steps are joined, those before the end of an episode alone.
@@ -45,7 +45,7 @@ class Aggregate:
     def __call__(
         self, scores: Float[Tensor, "*b S T N"], alive: Bool[Tensor, "*b S T _"] | None = None
     ) -> Float[Tensor, "*b S"]:
-        """The totals; an agent none of whose steps counts has 0.
+        """Return the totals; an agent none of whose steps counts has 0.
 
         Args:
             scores: of all steps.
@@ -76,7 +76,7 @@ mean_then_sum = Aggregate("mean", "sum")
 
 @dataclass(frozen=True)
 class KeyScore:
-    """Score that is read from an entry of the TensorDict, written there by the environment or by a module.
+    """A score read from an entry of the TensorDict, written there by the environment or by a module.
 
     Args:
         key: [*b, S], [*b, S, N] or [*b, S, N, 1], any number or bool.
@@ -91,7 +91,7 @@ class KeyScore:
     valid_key: NestedKey | None = None
 
     def __call__(self, tensordict: TensorDictBase) -> Float[Tensor, "*b S N"]:
-        """The scores; KeyError if an entry is absent, ValueError if the mask is not one of these agents."""
+        """Return the scores; KeyError if an entry is absent, ValueError if the mask does not fit the agents."""
         if self.module is not None:
             # Modules write into what they are given, and whatever is in the state is carried to the next step.
             tensordict = self.module(tensordict.copy())
@@ -118,7 +118,7 @@ def _entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def takes_groups(rule: object) -> bool:
-    """Whether a rule wants to see the groups."""
+    """Return whether a rule takes groups."""
     return bool(getattr(rule, "takes_groups", False))
 
 
@@ -129,7 +129,7 @@ def _needed(noise: Tensor | None) -> Tensor:
 
 
 def _slots(totals: Float[Tensor, "*b S"]) -> Int[Tensor, "*b S"]:
-    """The parents where every slot goes on from itself."""
+    """Return the parents if every slot continues itself."""
     return torch.arange(totals.shape[-1], device=totals.device).expand(totals.shape)
 
 
@@ -149,7 +149,7 @@ class KeepBest:
             raise ValueError(f"the kept fraction must be in (0, 1], is {self.fraction}")
 
     def __call__(self, totals: Float[Tensor, "*b S"], noise: Tensor | None = None) -> Int[Tensor, "*b S"]:
-        """Parents of the S slots; needs no noise."""
+        """Return parents of the S slots; needs no noise."""
         ranked = totals.argsort(dim=-1, stable=True)
         slots = torch.arange(totals.shape[-1], device=totals.device)
         # The margin takes back what rounding may add: 0.1 * 30 is a little more than 3.
@@ -161,7 +161,7 @@ class KeepAll:
     """Prune nothing: S independent rollouts, scored."""
 
     def __call__(self, totals: Float[Tensor, "*b S"], noise: Tensor | None = None) -> Int[Tensor, "*b S"]:
-        """Every slot is its own parent."""
+        """Return every slot as its own parent."""
         return _slots(totals)
 
 
@@ -189,13 +189,13 @@ class Resampling:
             raise ValueError(f"the temperature must be positive, is {self.temperature}")
 
     def resamples(self, totals: Float[Tensor, "*b S"]) -> Bool[Tensor, "*b"]:
-        """Whether a row is resampled, or its branches go on as they are."""
+        """Return which rows are resampled; the branches of the others go on as they are."""
         if self.threshold >= 1.0:
             return torch.ones_like(totals[..., 0], dtype=torch.bool)
         return sample_size(self._logits(totals)) <= self.threshold * totals.shape[-1]
 
     def __call__(self, totals: Float[Tensor, "*b S"], noise: Tensor | None = None) -> Int[Tensor, "*b S"]:
-        """Parents of the S slots; NaN counts as infinitely bad. Raises ValueError without noise."""
+        """Return parents of the S slots; NaN counts as infinitely bad. Raises ValueError without noise."""
         noise = _needed(noise)
         ranked = totals.argsort(dim=-1, stable=True)
         weights = torch.softmax(self._logits(totals.gather(-1, ranked)), -1)
@@ -211,7 +211,7 @@ class Resampling:
     def _copies(
         self, weights: Float[Tensor, "*b S"], slots: Int[Tensor, " S"], shift: Float[Tensor, "*b _"]
     ) -> Int[Tensor, "*b S"]:
-        """The ranks that the slots go on from, ascending."""
+        """Return the ranks that the slots continue from, ascending."""
         return _at(weights, (slots + shift) / len(slots))
 
 
@@ -241,7 +241,7 @@ class Residual(Resampling):
 
 
 def _at(weights: Float[Tensor, "*b S"], points: Float[Tensor, "*b S"]) -> Int[Tensor, "*b S"]:
-    """The branches at points in [0, 1) of their cumulated weights."""
+    """Return the branches at points in [0, 1) of their cumulated weights."""
     cumulative = weights.cumsum(-1)
     drawn = torch.searchsorted(cumulative, points * cumulative[..., -1:], right=True)
     # Rounding may carry the last point up to the total, past the last branch that has any weight.
@@ -249,7 +249,7 @@ def _at(weights: Float[Tensor, "*b S"], points: Float[Tensor, "*b S"]) -> Int[Te
 
 
 def sample_size(log_weights: Float[Tensor, "*b S"]) -> Float[Tensor, "*b"]:
-    """Effective sample size 1 / sum(w^2) of the normalised weights, between 1 and S."""
+    """Return effective sample size 1 / sum(w^2) of the normalised weights, between 1 and S."""
     return (2 * log_weights.logsumexp(-1) - (2 * log_weights).logsumexp(-1)).exp()
 
 
@@ -279,7 +279,7 @@ class ReplaceBad:
         noise: Float[Tensor, "*b"] | None = None,
         groups: Int[Tensor, "*b S"] | None = None,
     ) -> Int[Tensor, "*b S"]:
-        """Parents of the S slots by one uniform number per row. Raises ValueError without noise."""
+        """Return parents of the S slots by one uniform number per row. Raises ValueError without noise."""
         noise = _needed(noise)
         slots, good = _slots(totals), totals <= self.threshold
         groups = torch.zeros_like(slots) if groups is None else groups
@@ -298,14 +298,14 @@ class ReplaceBad:
 
 
 class Pruning:
-    """What a rule decides from period to period of one search, with groups and weights carried on.
+    """The decisions of a rule over the periods of one search, with groups and weights carried on.
 
     The arguments are those of :func:`symphony.collectors.beam_search`.
 
     Attributes:
         totals: of each period [*b, S].
         seen: what the rule saw of them.
-        parents: the slots that slots went on from.
+        parents: the slots that each slot continued from.
         active: rows [*b] in which some episode went on.
         log_weights: of the branches before each pruning, for rules that weigh.
     """
@@ -345,8 +345,8 @@ class Pruning:
         *,
         keep_all: bool = False,
     ) -> Int[Tensor, "*b S"]:
-        """Parents of the slots after a period, which went on in `active` rows and led to states of a `worth`; the
-        slots themselves if all are kept.
+        """Return the parents of the slots after a period, which went on in `active` rows and led to states of value
+        `worth`; the slots themselves if all are kept.
         """
         carried = totals.detach() if self._carried is None else self._carried + totals.detach()
         seen = carried if worth is None else carried + worth
@@ -372,7 +372,7 @@ class Pruning:
         return slots
 
     def last_weights(self) -> tuple[Float[Tensor, "*b S"] | None, Float[Tensor, "*b"] | None]:
-        """Log-weights of the slots after the last pruning, relative to their mean, and the log-evidence."""
+        """Return log-weights of the slots after the last pruning, relative to their mean, and the log-evidence."""
         if self.weighs is None or self._carried is None:
             return None, None
         weights = -self._carried.double() / self.weighs.temperature
@@ -385,7 +385,7 @@ def _log_mean(log_weights: Float[Tensor, "*b S"]) -> Float[Tensor, "*b"]:
 
 
 def _groups(start: TensorDictBase, key: NestedKey) -> Int[Tensor, "*b S"]:
-    """The group of each branch: its number, or the first branch that agrees with it in all of its numbers."""
+    """Return the group of each branch: its number, or the first branch that agrees with it in all of its numbers."""
     value = start.get(key, torch.zeros(()))
     if value.is_floating_point() or value.shape[: start.ndim] != start.shape or value.ndim > start.ndim + 1:
         raise ValueError(f"{key!r} in the start state must be integers, one or some per branch")
@@ -400,7 +400,7 @@ def checked(
     noise: Tensor | None = None,
     groups: Int[Tensor, "*b S"] | None = None,
 ) -> Int[Tensor, "*b S"]:
-    """The branch each slot goes on from; ValueError if a rule fails or returns anything but int64 indices of them."""
+    """Return the branch that each slot continues from; ValueError if a rule fails or returns anything else."""
     own = isinstance(rule, KeepAll | KeepBest | Resampling | ReplaceBad)
     try:
         parents = rule(totals, noise, groups) if takes_groups(rule) else rule(totals, noise)

@@ -1,4 +1,4 @@
-"""What an agent is: what it observes, how large its networks are, how it is simulated."""
+"""The configuration of an agent: what it observes, how large its networks are, how it is simulated."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Size = Annotated[int, Bounds(1, MOST)]
 
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig(Settings):
-    """What an agent observes and how large its networks are."""
+    """The observation of an agent and the sizes of its networks."""
 
     #: Interactive agents per run segment (the paper uses 2 and 8).
     interactive: Annotated[Size, arg(aliases=("--interactive",))] = 2
@@ -110,7 +110,7 @@ class SearchConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class AgentSpec(Settings):
-    """All that it takes to build an agent's networks anew and to simulate it as trained; kept in its folder."""
+    """All that is needed to build an agent's networks again and to simulate it as trained; kept in its folder."""
 
     #: Kind of actions: `bicycle`, discrete ones; `displacement`, continuous ones that gradients pass (section V-A).
     action_space: ActionSpace
@@ -131,7 +131,7 @@ class AgentSpec(Settings):
 
     @property
     def code(self) -> dict[str, str]:
-        """Import paths of code that is not this package's, by the settings that name them."""
+        """The import paths of code that is not this package's, by the settings that name them."""
         paths = {"agent.encoder": self.agent.encoder, "agent.policy": self.agent.policy}
         paths |= {} if self.discriminator is None else {"discriminator.network": self.discriminator.network}
         paths["search.rule"] = self.search.rule

@@ -1,4 +1,4 @@
-"""What settings may be: their types say it, and it is checked when a configuration is made."""
+"""The allowed values of settings: their types state them, and every new configuration is checked."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from symphony.errors import ConfigError
 
 
 class Bounds(NamedTuple):
-    """Marks a setting with the least and the most that it may be, or how many values it has at least."""
+    """Marks a setting with its least and its greatest value, or with the least number of values it has."""
 
     least: float = 0.0
     most: float = sys.float_info.max
@@ -33,7 +33,7 @@ NotNegative = Annotated[float, Bounds()]
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Base of configurations; ConfigError for a setting that its type does not allow."""
+    """Base of configurations; raises a ConfigError for a setting that its type does not allow."""
 
     def __post_init__(self) -> None:
         kind: Any = type(self)
@@ -42,7 +42,7 @@ class Settings:
 
 
 def check(told: str, value: Any, hint: Any) -> None:
-    """Raise ConfigError for a value, told by this name, that an annotation does not allow."""
+    """Raise a ConfigError that calls a value ``told`` if an annotation does not allow it."""
     if isinstance(value, float) and math.isnan(value):
         raise ConfigError(f"{told} must be a number, is nan")
     for mark in getattr(hint, "__metadata__", ()):
@@ -64,5 +64,5 @@ def check(told: str, value: Any, hint: Any) -> None:
 
 @functools.cache
 def type_hints(kind: Any) -> dict[str, Any]:
-    """Annotations of a class by the names of its fields, with their marks; compiles them once."""
+    """Return the annotations of a class by field, with their marks; compiles them once."""
     return get_type_hints(kind, include_extras=True)

@@ -1,4 +1,4 @@
-"""How agents are simulated and evaluated."""
+"""Settings of simulation and evaluation."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MOST_SECONDS = 1e6
 
 
 def compiles(choice: Compile, device: str, searches: int) -> bool:
-    """Whether the steps of so many searches (or batches of rollouts) are compiled on a device."""
+    """Return whether the steps of this many searches (or batches of rollouts) are compiled on a device."""
     return choice == "yes" or (choice == "auto" and device != "cpu" and searches >= SEARCHES)
 
 
@@ -49,7 +49,7 @@ def check_planner_seconds(seconds: float) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationConfig(Settings):
-    """How an agent is simulated, whatever the rollouts are for."""
+    """Settings of a simulation, whatever the rollouts are for."""
 
     #: Search that the rollouts come from. `agent`: the agent's own; `none`: no search; `tree`: beam search;
     #: `backtrack`: independent rollouts, each of which goes back and tries again where it is bad.
@@ -83,7 +83,7 @@ class SimulationConfig(Settings):
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(SimulationConfig)}
 
     def pruning(self, trained: SearchConfig) -> SearchConfig:
-        """The search: as in training, but for what is set here."""
+        """Return the settings of the search: as in training, except for what is set here."""
         names = ("score", "rule", "prune_every", "temperature", "goals")
         asked = {"test_branches": self.branches} | {name: getattr(self, name) for name in names}
         given = {name: value for name, value in asked.items() if value not in ("agent", 0)}
@@ -95,7 +95,7 @@ class SimulationConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig(SimulationConfig):
-    """How agents are evaluated."""
+    """Settings of an evaluation."""
 
     rollouts: Count = 16  # Rollouts of each run segment.
     #: Search trees per run segment, each with goals of its own; each gives its share of the rollouts. If those are
@@ -141,7 +141,7 @@ class EvaluateConfig(SimulationConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateConfig(EvaluateConfig):
-    """How agents are simulated where nothing is compared with the log, so that open traffic can go on past it."""
+    """Settings of a simulation that is not compared with the log, so that open traffic can go on past its end."""
 
     #: Vehicles per second that want to enter on each lane that begins at the edge of the map, past the end of a log
     #: that is shorter than `duration`; by default as many as came in the log.
@@ -167,7 +167,7 @@ FUTURE, DT = 80, 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class WosacSettings(SimulationConfig):
-    """How the agent is simulated; each of the 32 rollouts of a search comes from a tree of its own."""
+    """Settings of the simulation; each of the 32 rollouts of a search comes from a tree of its own."""
 
     #: Score that a search lowers. `agent`: as is best for the agent; `discriminator`: what the agent's own calls
     #: unreal; `rule`: collisions, also those within half a second, were everyone to keep speed and course, and time
@@ -188,15 +188,15 @@ class WosacSettings(SimulationConfig):
 
     @property
     def future(self) -> int:
-        """Steps that are simulated and scored."""
+        """The number of steps that are simulated and scored."""
         return round(self.horizon / DT)
 
     @classmethod
     def of(cls, config: EvaluateConfig) -> Self:
-        """The same simulation, of everyone; ConfigError where it searches by the true flags."""
+        """Return the settings of the same simulation of all agents; ConfigError if it searches by the true flags."""
         return cls(**config.simulation, logged_goals=config.logged_goals)
 
     def config(self, rollouts: int, seed: int) -> EvaluateConfig:
-        """The settings of some rollouts, each from a tree of its own where there is a search."""
+        """Return the settings of some rollouts, each from a tree of its own where there is a search."""
         same = self.simulation | {"logged_goals": self.logged_goals, "seed": seed}
         return EvaluateConfig(**same, rollouts=rollouts, trees=rollouts)

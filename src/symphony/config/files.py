@@ -1,4 +1,4 @@
-"""Configurations as JSON, and back with every type and range checked."""
+"""Configurations written as JSON, and read back with every type and range checked."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FORMAT = 3
 
 
 def to_json(config: Any) -> str:
-    """A configuration as text that :func:`read_json` reads back."""
+    """Return a configuration as text that :func:`read_json` reads back."""
     return json.dumps({"format": FORMAT, **dataclasses.asdict(config)}, indent=2, default=str) + "\n"
 
 
@@ -25,7 +25,7 @@ def read_json(kind: type[Any], file: Path) -> Any:
     """Read a configuration that :func:`to_json` wrote; settings of older agents become today's.
 
     Raises:
-        ConfigError: if it is no such file; names it and the setting.
+        ConfigError: if it is not such a file; names it and the setting.
     """
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
@@ -43,14 +43,14 @@ def read_json(kind: type[Any], file: Path) -> Any:
 def from_dict(kind: Any, values: dict[str, Any], *, where: str = "") -> Any:
     """Build a configuration from plain values.
 
-    Settings that are gone are left out where they said what always holds now: ``GONE`` of a class has these values by
-    name, ``...`` for what mattered to the training only, and a function where the value follows from the others. A
+    Removed settings are left out where they had the value that always holds now: ``GONE`` of a class has these values
+    by name, ``...`` for what mattered to the training only, and a function where the value follows from the others. A
     field whose metadata have ``before`` meant that where it is missing.
 
     Args:
         kind: the dataclass.
         values: by the names of its fields, nested ones as dicts.
-        where: put before what is told of an error.
+        where: put before the message of an error.
 
     Raises:
         ConfigError: for an unknown name, a missing one, another type or a value out of range.
@@ -78,7 +78,7 @@ def from_dict(kind: Any, values: dict[str, Any], *, where: str = "") -> Any:
 
 
 def _typed(hint: Any, value: Any, where: str, name: str) -> Any:
-    """A value as its annotation wants it."""
+    """Return a value as its annotation wants it."""
     if get_origin(hint) is Annotated:
         hint = hint.__origin__
     origin, options = get_origin(hint), get_args(hint)

@@ -1,4 +1,4 @@
-"""Settings of a training that go together, as options of the command line."""
+"""Training settings that go together, as an option of the command line."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ PROFILES: dict[Profile, str] = {
 
 
 def expanded(args: Sequence[str]) -> list[str]:
-    """Arguments of a training command with the options of their ``--profile`` that are not among them.
+    """Return arguments of a training command with the options of their ``--profile`` that are not among them.
 
     Raises:
         ConfigError: for an unknown profile.

@@ -1,4 +1,4 @@
-"""How agents are trained."""
+"""Settings of a training."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MAX_SEED = (1 << 40) - 1
 
 @dataclass(frozen=True, kw_only=True)
 class MGAILConfig(Settings):
-    """How a policy learns from the gradient of the discriminator (methods mgail*)."""
+    """Settings of learning from the gradient of the discriminator (methods mgail*)."""
 
     #: Updates of plain regression to the log before the adversarial ones, which need a start that stays on the
     #: road (0: none, as in the paper).
@@ -57,13 +57,13 @@ class MGAILConfig(Settings):
 
     @property
     def gradient(self) -> dict[str, Any]:
-        """How the gradient reaches the policy, as :class:`symphony.objectives.MGAILLoss` takes it."""
+        """The settings of the gradient to the policy, as :class:`symphony.objectives.MGAILLoss` takes them."""
         return {"cost": self.cost, "detach_keys": () if self.react else SEEN, "truncate": self.truncate}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ValidationConfig(Settings):
-    """How checkpoints are evaluated while training; the best of them is the agent."""
+    """Settings of the evaluation of checkpoints during training; the best of them is the agent."""
 
     #: Store of run segments to evaluate checkpoints on; without one the last checkpoint is the agent.
     data: Path | None = None
@@ -73,7 +73,7 @@ class ValidationConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class PerturbConfig(Settings):
-    """Logged states displaced, labelled with the action of a smooth return to the log."""
+    """Settings of logged states that are displaced and labelled with the action of a smooth return to the log."""
 
     #: Share of the expert states of an update that are displaced (0: none, as in the paper).
     share: Annotated[float, Bounds(0, 1)] = 0.0
@@ -81,13 +81,13 @@ class PerturbConfig(Settings):
     begin: Natural = 0
 
     def at(self, step: int) -> PerturbConfig | None:
-        """What holds at an update; None where no state is displaced."""
+        """Return the settings at an update; None where no state is displaced."""
         return self if self.share and step >= self.begin else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class PreviewConfig(Settings):
-    """What a run lets see of its agent while it trains: animated rollouts, and distributions of what it does."""
+    """Settings of previews of an agent in training: animated rollouts, and distributions of what it does."""
 
     #: Updates between previews, and one at the end of a run that has so many (0: never); by default this takes about
     #: a hundredth of the time on a CPU, or less.
@@ -96,7 +96,7 @@ class PreviewConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Settings):
-    """What the trainer needs to know of a run, whatever is trained."""
+    """Settings of a run that the trainer needs, whatever is trained."""
 
     data: Path  # Store of run segments to learn from (see `symphony data convert`).
     out: Path  # Folder of the run: configuration, metrics, checkpoints.
@@ -123,7 +123,7 @@ class RunConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig(RunConfig):
-    """Train agents."""
+    """All settings of a training."""
 
     #: Method to train: behavioural cloning or MGAIL, with goals (h), with tree search (ts), with both; `bc_rl_h`:
     #: cloning and a policy gradient against collisions in closed loop, for an agent that drives (--warm-start).
@@ -144,11 +144,11 @@ class TrainConfig(RunConfig):
     mgail: MGAILConfig = field(default_factory=MGAILConfig)  # Adversarial learning (methods mgail*).
 
     def spec(self, action_space: ActionSpace, dt: float, *, discriminator: bool = False, **more: Any) -> AgentSpec:
-        """What the agent is that a recipe trains.
+        """Return the specification of the agent that a recipe trains.
 
         Args:
-            action_space: its own.
-            dt: seconds per step of what it learns from.
+            action_space: that of the agent.
+            dt: seconds per step of the training data.
             discriminator: whether it has one.
             more: ``goals``, whether it follows routes; ``searches``, whether it is simulated with search.
         """
@@ -158,15 +158,15 @@ class TrainConfig(RunConfig):
 
     @property
     def scenes(self) -> dict[str, Any]:
-        """Which run segments are learned from and how they are drawn, as :class:`SceneDataset` takes it."""
+        """The choice of run segments to learn from and how they are drawn, as :class:`SceneDataset` takes it."""
         together = self.rows(1 << 30) // self.segments
         few_shapes = compiles(self.compile, self.device, self.steps // (self.search.updates * together))
         how = {"interactive": self.agent.interactive, "duration": self.duration}
         return how | {"few_shapes": few_shapes}
 
     def rows(self, segments: int) -> int:
-        """Run segments searched as one, of so many that there are: on a device up to :data:`ROWS`, as long as no
-        update learns from states :data:`AGE` updates old, and checkpoints come between searches.
+        """Return how many of ``segments`` run segments are searched together: on a device up to :data:`ROWS`, as long
+        as no update learns from states :data:`AGE` updates old, and checkpoints come between searches.
         """
         each, every = min(self.segments, segments), self.search.updates
         most = 1 if self.device == "cpu" else min(ROWS // each, AGE // every, segments // each)
@@ -174,6 +174,6 @@ class TrainConfig(RunConfig):
         return each * (min(self.together, segments // each) or next(fits, 1))
 
     def rates(self, optimizers: Iterable[str]) -> dict[str, float]:
-        """Learning rates by network, before they fall."""
+        """Return the learning rates by network, before they fall."""
         own = {"discriminator": DISCRIMINATOR_RATE}
         return {name: own.get(name, self.learning_rate) for name in optimizers}

@@ -1,8 +1,8 @@
-"""Does a reader do what it promises? :func:`check_reader` finds out, for our readers and for anybody's.
+"""Checks that a reader keeps its contract: :func:`check_reader`, for our readers and for others.
 
-:func:`~symphony.data.segment.validate` sees shapes and ranges only; metres per second that are miles per hour fit the
-schema as well. Here segments are looked at for what the schema means: units, frames, sides and directions, in numbers
-that are pooled over all segments given, so that the odd spike of a real log does not count.
+:func:`~symphony.data.segment.validate` sees shapes and ranges only; speeds in miles per hour fit the schema as well.
+Here segments are looked at for what the schema means: units, frames, sides and directions, in numbers that are pooled
+over all segments given, so that a rare spike in a real log does not count.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ OPTIONAL = ("neighbor_side", "neighbor_along", "lane_width", "speed_limit")
 
 @dataclass
 class Conformance:
-    """What a check of a reader or of segments has found."""
+    """The findings of a check of a reader or of segments."""
 
     segments: int = 0  # how many were checked
     skipped: list[DataError] = field(default_factory=list)  # what the reader gave for records instead
@@ -61,11 +61,11 @@ class Conformance:
     failures: dict[str, list[str]] = field(default_factory=dict)  # check -> what is wrong
 
     def fail(self, check: str, message: str) -> None:
-        """Note a failure."""
+        """Record a failure."""
         self.failures.setdefault(check, []).append(message)
 
     def passed(self) -> Conformance:
-        """Return the same, or raise a :class:`ConformanceError` that names every check that failed."""
+        """Return this object, or raise a :class:`ConformanceError` that names every check that failed."""
         if self.failures:
             raise ConformanceError(self)
         return self
@@ -81,7 +81,7 @@ class ConformanceError(AssertionError):
 
 
 def check_segments(segments: Sequence[RunSegment]) -> Conformance:
-    """Check run segments of one source, however they came about.
+    """Check run segments of one source, whatever made them.
 
     Checks: ``schema`` (validation), ``ids`` (unique), ``store`` (survives the store unchanged), and those of
     :data:`RANGES`, some of which need segments in which vehicles move. Raises a :class:`ConformanceError`.
@@ -92,10 +92,10 @@ def check_segments(segments: Sequence[RunSegment]) -> Conformance:
 def check_reader(reader: Reader, files: Iterable[str | Path]) -> Conformance:
     """Check a reader with a few good files of its format, with moving vehicles.
 
-    Besides the checks of :func:`check_segments`: ``errors`` (nothing but :class:`DataError` comes of reading, and
-    it names the file), ``source`` (segments name format and file) and ``determinism`` (reading again, in another
-    order, gives equal content). Errors of single records are allowed and reported. A :class:`ConformanceError` names
-    every check that failed.
+    Besides the checks of :func:`check_segments`: ``errors`` (reading raises nothing but :class:`DataError`, which
+    names the file), ``source`` (segments name format and file) and ``determinism`` (reading again, in another order,
+    gives equal content). Errors of single records are allowed and reported. A :class:`ConformanceError` names every
+    check that failed.
     """
     paths = [Path(file) for file in files]
     report = Conformance()
@@ -114,7 +114,7 @@ def check_reader(reader: Reader, files: Iterable[str | Path]) -> Conformance:
 
 
 def _read(reader: Reader, path: Path, report: Conformance) -> list[Item]:
-    """What a file gives, with everything it must never give noted."""
+    """Return what a file yields, and report everything that it must never yield."""
     items: list[Item] = []
     try:
         items.extend(reader.read(path))
@@ -130,7 +130,7 @@ def _read(reader: Reader, path: Path, report: Conformance) -> list[Item]:
 
 
 def _hashes(items: Iterable[Item]) -> list[str]:
-    """Content hash and group per segment, an empty text per error."""
+    """Return the content hash and group of each segment, and an empty text for each error."""
     segments = (item if isinstance(item, RunSegment) else None for item in items)
     return ["" if s is None else f"{content_hash(s)} {s.group or s.segment_id}" for s in segments]
 
@@ -169,7 +169,7 @@ def _inspected(segments: Sequence[RunSegment], report: Conformance) -> Conforman
 
 
 def _moving(s: RunSegment) -> NDArray[np.bool_]:
-    """[A, T] states of vehicles that move."""
+    """Return [A, T] which states are of moving vehicles."""
     vehicle = (s.agent_type == AgentType.VEHICLE)[:, None]
     return s.valid & vehicle & (np.hypot(s.velocity[..., 0], s.velocity[..., 1]) > MOVING)
 
@@ -221,7 +221,7 @@ def _graph(s: RunSegment) -> dict[str, Any]:
 
 
 def _beside(lanes: Polylines, lane: int, other: int, sign: float) -> tuple[bool, bool]:
-    """Whether the other lane is on that side of the middle of the one, and runs the same way there."""
+    """Return whether the other lane is on that side of the middle of the one, and runs the same way there."""
     mine, theirs = (lanes[k][:, :2].astype(np.float64) for k in (lane, other))
     middle = len(mine) // 2
     nearest = int(np.hypot(*(theirs - mine[middle]).T).argmin())
@@ -231,7 +231,7 @@ def _beside(lanes: Polylines, lane: int, other: int, sign: float) -> tuple[bool,
 
 
 def _on_map(s: RunSegment) -> dict[str, Any]:
-    """Which moving vehicles find no lane along their heading, or are right of the nearest edge."""
+    """Return which moving vehicles find no lane along their heading, or are right of the nearest edge."""
     moving = _moving(s)
     place = s.position[moving][:, :2].astype(np.float64)
     spots = shapely.points(place)
@@ -255,7 +255,7 @@ def _on_map(s: RunSegment) -> dict[str, Any]:
 
 
 def _edges(lines: Polylines) -> tuple[Doubles, Doubles]:
-    """(start, way to its end) [N, 2] of the edges of all lines."""
+    """Return (start, vector to its end) [N, 2] of the edges of all lines."""
     points = lines.points[:, :2].astype(np.float64)
     start = np.setdiff1d(np.arange(len(points)), lines.offsets[1:] - 1)
     return points[start], points[start + 1] - points[start]

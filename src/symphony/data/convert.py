@@ -1,4 +1,4 @@
-"""Conversion of logged driving into a segment store, stores put together, and what a store holds.
+"""Conversion of logged driving into a segment store, merging of stores, and summaries of stores.
 
 The folder ``NAME.partial`` beside the store-to-be ``NAME`` holds a conversion that is not finished::
 
@@ -45,7 +45,7 @@ ODD = "odd"  # tag of a segment with something unusual: what it is -> an example
 
 @dataclass(frozen=True)
 class Preparation:
-    """How the records of a file become segments: see :func:`symphony.data.convert.convert`."""
+    """Settings by which the records of a file become segments: see :func:`symphony.data.convert.convert`."""
 
     reader: Reader
     dt: float
@@ -57,7 +57,7 @@ class Preparation:
     strict: bool = False
 
     def outcomes(self, path: str) -> Iterator[RunSegment | Skip]:
-        """Yield what becomes of each record of a file, in its order."""
+        """Yield a segment or a skip for each record of a file, in its order."""
         for record in self.reader.read(path):
             if isinstance(record, DataError):
                 yield Skip.of(record, path)
@@ -104,7 +104,7 @@ class Task:
 
 
 def tasks_of(recipe: Preparation, files: list[list[Any]], folder: Path) -> list[Task]:
-    """Return the parts that files (path, bytes) are converted in; they depend on nothing but the sizes."""
+    """Return the parts that files (path, bytes) are converted in; they depend only on the sizes."""
     groups: list[list[str]] = []
     total = 0
     for name, size in files:
@@ -174,9 +174,9 @@ def convert(
     """Convert logs into a segment store.
 
     The store appears under its name once it is complete; until then the work lies in ``OUT.partial``. A conversion
-    that is interrupted, however rudely, goes on there when it is called again with the same arguments, and gives the
-    same store and report as one that was not. One that fails leaves no store behind. A record or file that can't be
-    used is counted, reported and skipped.
+    that is interrupted or killed goes on there when it is called again with the same arguments, and gives the same
+    store and report as one that was not. One that fails leaves no store behind. A record or file that can't be used
+    is counted, reported and skipped.
 
     Args:
         reader: name of the format, or a reader.
@@ -197,8 +197,8 @@ def convert(
     Returns the report, which is kept with the store as well.
 
     Raises:
-        ConfigError: an argument that can't be, or is another than an unfinished conversion there was begun with.
-        DataError: ``out`` exists already, or not one segment could be converted.
+        ConfigError: an argument is invalid, or is not the one that an unfinished conversion there was begun with.
+        DataError: ``out`` exists already, or no segment could be converted.
         SymphonyError: a worker process died; what is done stays, as after an interrupt.
     """
     for name, value, least, most in (
@@ -260,7 +260,7 @@ def convert(
 
 
 def _reader(reader: str | Reader, options: Mapping[str, Any] | None) -> tuple[Reader, dict[str, Any]]:
-    """The reader and what it was made with, as far as one that is given keeps that under the same names."""
+    """Return the reader and its options, as far as a given one keeps them under the names of its arguments."""
     if isinstance(reader, str):
         return get_reader(reader, **(options or {})), dict(options or {})
     asked, plain = inspect.signature(type(reader)).parameters, (str, int, float, bool, type(None))
@@ -270,14 +270,14 @@ def _reader(reader: str | Reader, options: Mapping[str, Any] | None) -> tuple[Re
 
 @dataclass(frozen=True)
 class Job:
-    """What a conversion does."""
+    """The description of a conversion."""
 
     settings: dict[str, Any]  # arguments that its results depend on
     files: list[list[Any]]  # path and bytes of every file, in order
     changed: dict[str, int]  # when each, and each that is read with one, was last changed (nanoseconds)
 
     def check_same(self, begun: Job, folder: Path) -> None:
-        """Refuse to go on with a conversion that was begun otherwise; names the first thing that differs."""
+        """Refuse to go on with a conversion that was begun with other arguments; names the first that differs."""
         for name in {**begun.settings, **self.settings}:
             old, new = begun.settings.get(name), self.settings.get(name)
             if old != new:
@@ -295,7 +295,7 @@ class Job:
 
 
 def read_job(folder: Path) -> Job | None:
-    """Return what was begun in a folder, None where nothing was; a :class:`DataError` if it is no such job."""
+    """Return the job begun in a folder, None where there is none; a :class:`DataError` if it is not a job."""
     path = folder / JOB
     if not path.is_file():
         return None
@@ -317,7 +317,7 @@ def folder_of(out: Path) -> Path:
 
 
 def _check_free(out: Path, begun: Job | None) -> None:
-    """Refuse a place where something is already."""
+    """Refuse a place where something exists already."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
     message = "is a segment store already: choose another name (`symphony data merge` puts stores together)"
@@ -341,7 +341,7 @@ def _begin(job: Job, folder: Path) -> None:
 
 
 def _collected(how: Preparation, job: Job, folder: Path, workers: int, engine: Engine, tell: Progress) -> Report:
-    """Make the parts that are missing, and copy what they hold, in their order, into one store."""
+    """Make the missing parts, and copy their content, in order, into one store."""
     tasks = tasks_of(how, job.files, folder / PARTS)
     report = Report(settings=dict(job.settings))
     shutil.rmtree(folder / STORE, ignore_errors=True)
@@ -362,7 +362,7 @@ def _collected(how: Preparation, job: Job, folder: Path, workers: int, engine: E
 
 
 def _take(entry: Any, part: SegmentStore, file: str, writer: StoreWriter, report: Report) -> None:
-    """Copy a segment of a part, or note what else became of a record."""
+    """Copy a segment of a part, or record why there is none."""
     if not isinstance(entry, int):
         report.skipped.append(Skip(**entry))
     elif writer.has(part.ids[entry]):
@@ -377,7 +377,7 @@ def _take(entry: Any, part: SegmentStore, file: str, writer: StoreWriter, report
 
 
 def _remove(folder: Path) -> None:
-    """Half a part must not count; without a job, whatever is found is taken for rubbish: so that goes last."""
+    """Remove a finished job's folder: first the parts, since half a part must not count, and the job file last."""
     (folder / PARTS).rename(folder / STALE)
     for name in (STALE, STORE):
         shutil.rmtree(folder / name, ignore_errors=True)

@@ -48,13 +48,13 @@ class Task(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the network in the segments' tags."""
+        """The name of the network in the segments' tags."""
         return f"{kind_name(self.kind)}-{self.seed}"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All that decides what is in a generated store.
+    """The settings that determine a generated store.
 
     Raises a :class:`ConfigError` for a value out of range; names the field.
     """
@@ -141,9 +141,9 @@ BARREN = 50  # networks in a row that may give nothing before the plan is given 
 
 @dataclass(frozen=True)
 class Harvest:
-    """What one network gave: the segments taken, how many could have been, and why windows were left out.
+    """The yield of one network: the segments taken, how many there could have been, and why windows were left out.
 
-    ``error`` is why it gave nothing at all, if it failed; ``seconds`` of one core is what it took.
+    ``error`` says why it gave nothing at all, if it failed; ``seconds`` is the time it took on one core.
     """
 
     task: Task
@@ -172,7 +172,7 @@ def harvest(task: Task) -> Harvest:
 
 
 def _spread(segments: list[RunSegment], count: int, rng: np.random.Generator) -> list[RunSegment]:
-    """At most ``count`` of the segments, each map giving one in turn, at random."""
+    """Return at most ``count`` of the segments, one from each map in turn, at random."""
     by_map: dict[int, list[RunSegment]] = {}
     for segment in segments:
         by_map.setdefault(id(segment.road), []).append(segment)
@@ -184,7 +184,7 @@ def _spread(segments: list[RunSegment], count: int, rng: np.random.Generator) ->
 
 @dataclass
 class Generation:
-    """How far a plan is, as kept in its store's report."""
+    """The progress of a plan, as kept in its store's report."""
 
     networks: int = 0  # simulated, all their segments written
     accepted: int = 0  # segments they gave, of which some were taken
@@ -213,7 +213,7 @@ def generate(
 ) -> Generation:
     """Carry out a plan, or continue one that was interrupted at any moment; a finished store is left as it is.
 
-    The number of workers changes nothing in the store; for where they are, see :func:`symphony.parallel.ordered_map`.
+    The number of workers changes nothing in the store; for where they run, see :func:`symphony.parallel.ordered_map`.
     ``progress`` is told the segments in the store, and how far the plan is, after each network. Returns how the store
     was made, from its beginning.
 
@@ -254,7 +254,7 @@ def generate(
 
 
 def _begun(store: SegmentStore, settings: Mapping[str, Any]) -> Generation:
-    """Where to continue, after a look at whether this is the store of the same plan."""
+    """Return where to continue, after checking that the store is of the same plan."""
     report = store.report
     if not report and not len(store):
         return Generation()

@@ -1,4 +1,4 @@
-"""Lanes that go on into each other on the ground while their source has no link between them."""
+"""Missing links between lanes that continue each other on the ground."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TAG = "joined_gaps"  # of a stored segment: how many links were added to its map
 
 
 def joined(road: RoadMap) -> tuple[RoadMap, int]:
-    """A map with links across the gaps that its source has left between lanes, and how many were added.
+    """Return a map with links across the gaps that its source has left between lanes, and how many were added.
 
     A lane goes on into another where its end lies within :data:`REACH` and :data:`TURN` of the other's start, nearer
     to that than to the other's end and nearer than its own start does, and either both or none are for bicycles. Only
@@ -55,7 +55,7 @@ def joined(road: RoadMap) -> tuple[RoadMap, int]:
 
 
 def _ends(road: RoadMap) -> tuple[NDArray[Any], ...]:
-    """First and last point of each lane [L, 3], unit direction there [L, 2] on the ground, where there is one [L]."""
+    """Return first and last point of each lane [L, 3], unit direction there [L, 2] on the ground, if any [L]."""
     points, offsets = road.lanes.points.astype(np.float64), road.lanes.offsets
     step = np.diff(points[:, :2], axis=0)
     length = np.hypot(*step.T)

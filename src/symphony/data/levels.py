@@ -57,7 +57,7 @@ class Levels:
         self._spread()
 
     def _spread(self) -> None:
-        """Give each surface the number of the nearest one that has some, the lowest of equally near ones."""
+        """Give each surface the number of the nearest numbered one, the lowest of equally near ones."""
         one, other = [], []
         for dx, dy in _NEAR[1:]:
             for row, found in self._among(self._key + dx * _WIDE + dy):
@@ -82,7 +82,7 @@ class Levels:
             yield row, first[row] + rank
 
     def at(self, points: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-        """[..., 2] height and level (0 for none) of points [..., 3] on the ground, of what lies in their columns.
+        """Return [..., 2] height and level (0 for none) of points [..., 3] on the ground, from their columns.
 
         Points in columns without lines are taken to those of the nearest one within 10 m.
         """
@@ -103,17 +103,17 @@ class Levels:
 
 
 def levels_of(segment: RunSegment) -> Levels:
-    """The levels of a segment's lanes and boundary."""
+    """Return the levels of a segment's lanes and boundary."""
     return Levels(np.concatenate([dense(lines) for lines in (segment.road.lanes, segment.road.boundary)]))
 
 
 def ground(segment: RunSegment) -> NDArray[np.float32]:
-    """[A, T, 3] the place below each agent, whose logged one is the middle of its box."""
+    """Return [A, T, 3] the place below each agent, whose logged position is the middle of its box."""
     return segment.position - (segment.size * np.array([0, 0, 0.5], np.float32))[:, None]
 
 
 def agent_heights(segment: RunSegment, levels: Levels | None = None) -> NDArray[np.float32]:
-    """[T, A, 2] height and level of logged agents, no level where they are not seen; [0, 0, 2] for a flat map."""
+    """Return [T, A, 2] height and level of logged agents, no level if not seen; [0, 0, 2] for a flat map."""
     levels = levels_of(segment) if levels is None else levels
     if levels.flat:
         return np.zeros((0, 0, 2), np.float32)
@@ -121,7 +121,7 @@ def agent_heights(segment: RunSegment, levels: Levels | None = None) -> NDArray[
 
 
 def dense(lines: Polylines) -> NDArray[np.float64]:
-    """[P, 3] points of lines and so many between them that neighbours are at most :data:`SPACING` apart."""
+    """Return [P, 3] points of lines and of others between them: neighbours are at most :data:`SPACING` apart."""
     points = lines.points.astype(np.float64)
     if len(points) == 0 or np.ptp(points[:, 2]) == 0:
         return points  # one height: where along the lines does not matter
@@ -135,11 +135,11 @@ def dense(lines: Polylines) -> NDArray[np.float64]:
 
 
 def shares(count: NDArray[np.int64]) -> NDArray[np.float64]:
-    """0, 1 / n, 2 / n, ... (n - 1) / n for each number n, one after the other."""
+    """Return 0, 1 / n, 2 / n, ... (n - 1) / n for each number n, one after the other."""
     return (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)) / np.repeat(count, count)
 
 
 def _columns(points: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
-    """[P] number of the column of each point."""
+    """Return [P] the number of each point's column."""
     cell = np.floor(points[:, :2] / CELL).astype(np.int64) + _WIDE // 2
     return cell[:, 0] * _WIDE + cell[:, 1]

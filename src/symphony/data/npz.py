@@ -19,10 +19,10 @@ MOST = 1 << 29  # bytes of the arrays of an archive, unless more are allowed
 
 
 def read_npz(path: Path, names: Collection[str] = (), *, most: int = MOST) -> dict[str, NDArray[Any]]:
-    """The arrays of an archive by their names; nothing is unpickled.
+    """Return the arrays of an archive by their names; nothing is unpickled.
 
-    Before memory is asked for, their headers must claim what the archive holds, and that at most ``most`` bytes in
-    all, or a :class:`DataError` names file and field. With ``names``, only these are read.
+    Before memory is asked for, their headers must claim what the archive holds, and at most ``most`` bytes in all, or
+    a :class:`DataError` names file and field. With ``names``, only these are read.
     """
     found: dict[str, NDArray[Any]] = {}
     left, name = most, None

@@ -27,12 +27,12 @@ LATE_EGO = "steps left out before the ego comes"
 
 
 def noted(segment: RunSegment, found: Mapping[str, str]) -> RunSegment:
-    """The segment with more oddities, kind -> example; the first example of a kind stays."""
+    """Return the segment with more oddities, kind -> example; the first example of a kind stays."""
     return segment.replace(odd={**found, **segment.odd}) if found else segment
 
 
 def mended(segment: RunSegment) -> RunSegment:
-    """What remains of a segment that breaks the schema once single agents, states and lines are left out.
+    """Return a segment without the single agents, states and lines that break the schema.
 
     Left out are agents without a size, or of 100 m and more; states that are not finite or beyond
     :mod:`symphony.data.segment`, and of a track that jumps those a jump away from its longest piece; lines of the map
@@ -42,7 +42,7 @@ def mended(segment: RunSegment) -> RunSegment:
 
 
 def oddities(segment: RunSegment) -> list[str]:
-    """What is unusual about a valid segment: worth a look where it is frequent, no reason to leave it out."""
+    """Return what is unusual about a valid segment: worth a look where it is frequent, no reason to leave it out."""
     s, seen = segment, segment.valid
     sides = s.size[seen.any(1), :2]
     points = (s.road.lanes.points, s.road.boundary.points, s.road.marks.points)
@@ -76,7 +76,7 @@ def _lines(segment: RunSegment) -> RunSegment:
 
 
 def _plausible(lines: Polylines) -> Bools:
-    """[K] whether all points of a line are."""
+    """Return [K] whether all points of a line are plausible."""
     bad = ~(np.abs(lines.points) <= PLACE).all(axis=1)
     return np.bincount(lines.line_index[bad], minlength=len(lines)) == 0
 
@@ -100,7 +100,7 @@ def _states(segment: RunSegment) -> RunSegment:
 
 
 def _without_jumps(place: NDArray[np.float64], valid: Bools) -> Bools:
-    """[T] the valid steps of a track [T, 2] that are no jump away from its longest piece without one."""
+    """Return [T] the valid steps of a track [T, 2] that are not a jump away from its longest piece without one."""
     steps = np.flatnonzero(valid)
     piece = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(place[steps], axis=0).T) > schema.MAX_JUMP)])
     longest = steps[piece == np.bincount(piece).argmax()]
@@ -126,7 +126,7 @@ def _agents(segment: RunSegment) -> RunSegment:
 
 
 def from_ego(segment: RunSegment) -> RunSegment:
-    """A segment whose ego comes up to :data:`LATE` seconds after its first step, from the step at which it does."""
+    """Return a segment from the step at which its ego appears, if that is at most :data:`LATE` seconds in."""
     first = int(segment.valid[segment.ego].argmax())
     if not 0 < first * segment.dt <= LATE + 1e-6 or segment.num_steps - first < 2:
         return segment
@@ -137,7 +137,7 @@ def from_ego(segment: RunSegment) -> RunSegment:
 
 
 def with_agents(segment: RunSegment, kept: Bools) -> RunSegment:
-    """The agents that a mask [A] keeps, the ego among them, everything that refers to them renumbered."""
+    """Return a segment with the agents of a mask [A], the ego among them, and all references to them renumbered."""
     return segment.replace(
         ego=int(kept[: segment.ego].sum()),
         **{name: getattr(segment, name)[kept] for name in ("agent_id", "agent_type", "size", *STATES)},
@@ -147,7 +147,7 @@ def with_agents(segment: RunSegment, kept: Bools) -> RunSegment:
 
 
 def with_lanes(segment: RunSegment, kept: Bools) -> RunSegment:
-    """The lanes that a mask [L] keeps, with the links between them and their lights."""
+    """Return a segment with the lanes of a mask [L], the links between them and their lights."""
     road, lights = segment.road, kept[segment.signal_lane]
     pairs = {name: getattr(road, name) for name in ("successors", "left_neighbors", "right_neighbors")}
     names = ("lane_id", "lane_type", "speed_limit", "lane_width")
@@ -162,7 +162,7 @@ def with_lanes(segment: RunSegment, kept: Bools) -> RunSegment:
 
 
 def lines_of(lines: Polylines, kept: Bools) -> Polylines:
-    """The lines that a mask [K] keeps."""
+    """Return the lines of a mask [K]."""
     return Polylines.of([lines[k] for k in np.flatnonzero(kept).tolist()])
 
 
@@ -203,7 +203,7 @@ def _shape(points: NDArray[Any]) -> Any:
 
 
 def _pieces(line: NDArray[np.float32], area: Any) -> list[NDArray[np.float32]]:
-    """Stretches of a line [P, 3] of edges that touch an area, each uncut, in their order."""
+    """Return the stretches of a line [P, 3] of edges that touch an area, each uncut, in their order."""
     points = line[:, :2].astype(np.float64)
     if len(line) == 1:
         return [line] if shapely.intersects_xy(area, *points[0]) else []

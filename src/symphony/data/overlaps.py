@@ -19,7 +19,7 @@ TAG = "overlaps"  # of a stored segment that has some: how many pairs of agents
 
 
 def overlapping(segment: RunSegment) -> NDArray[np.int64]:
-    """[P, 2] pairs of agents, rows in order, whose oriented boxes overlap at some step.
+    """Return [P, 2] pairs of agents, rows in order, whose oriented boxes overlap at some step.
 
     At least one of the two is a vehicle that moves (more than :data:`~symphony.data.selection.MOVING` metres).
     Touching does not count, nor do boxes whose logged heights differ by :data:`~symphony.data.levels.LEVEL`.
@@ -31,7 +31,7 @@ def overlapping(segment: RunSegment) -> NDArray[np.int64]:
 
 
 def _pairs(segment: RunSegment, drivers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """[P, 2] pairs of one of the drivers and anybody, each in order, once for each step of an overlap."""
+    """Return [P, 2] pairs of one of the drivers and any agent, each in order, once for each step of an overlap."""
     position = segment.position[..., :2].astype(np.float64)
     heading = segment.heading.astype(np.float64)
     size = segment.size[:, :2].astype(np.float64)
@@ -52,7 +52,7 @@ def _pairs(segment: RunSegment, drivers: NDArray[np.int64]) -> NDArray[np.int64]
 
 
 def box_depth(way: Doubles, angle_a: Doubles, size_a: Doubles, angle_b: Doubles, size_b: Doubles) -> Doubles:
-    """[N] metres by which two boxes are in each other, by the separating-axis test; 0 or less if they are not.
+    """Return [N] metres by which two boxes overlap, by the separating-axis test; 0 or less if they do not.
 
     Takes the way [N, 2] from the centre of one to that of the other, headings [N], lengths and widths [N, 2].
     """

@@ -1,4 +1,4 @@
-"""What a conversion did, and what it left out for which reason."""
+"""The report of a conversion: what it did, and what it left out for which reason."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from symphony.errors import DataError
 
 @dataclass(frozen=True)
 class Skip:
-    """A record or file that was left out: why, and of what, where known.
+    """A record or file that was left out: the reason, and its place where known.
 
     ``exclusion`` is the one of :data:`symphony.data.selection.EXCLUSIONS` it fell under; empty for unusable data.
     """
@@ -28,31 +28,31 @@ class Skip:
 
     @property
     def reason(self) -> str:
-        """The message with numbers blanked, so that like cases are counted together."""
+        """The message with numbers blanked, so that similar cases are counted together."""
         text = re.sub(r"-?\d+(\.\d+)?", "#", self.message)
         return f"{self.field}: {text}" if self.field else text
 
     @classmethod
     def of(cls, error: DataError, path: object = "", segment: str = "", exclusion: str = "") -> Skip:
-        """Return what a report says of an error."""
+        """Return the report's entry for an error."""
         texts = (error.message, str(path), error.segment or segment, error.field or "", exclusion)
         # Half a character, as damaged text may hold, could not be written, and would end the conversion.
         return cls(*(text.encode(errors="backslashreplace").decode() for text in texts))
 
     def to_json(self) -> dict[str, str]:
-        """Return it as kept in a report: without ``exclusion`` where there is none."""
+        """Return the entry as kept in a report: without ``exclusion`` where there is none."""
         return {name: text for name, text in asdict(self).items() if text or name != "exclusion"}
 
     @property
     def error(self) -> DataError:
-        """The error it was."""
+        """The error behind this entry."""
         where = {"file": self.file or None, "segment": self.segment or None, "field": self.field or None}
         return DataError(self.message, **where)
 
 
 @dataclass
 class Report:
-    """What a conversion did."""
+    """The report of a conversion."""
 
     converted: int = 0  # segments added
     files: int = 0  # files read
@@ -64,14 +64,14 @@ class Report:
     odd_examples: dict[str, str] = field(default_factory=dict)  # the first of each kind of odd
 
     def note(self, odd: Mapping[str, str], segment: str) -> None:
-        """Count what is odd about a segment: kind -> example."""
+        """Count the oddities of a segment: kind -> example."""
         for kind, example in odd.items():
             self.odd[kind] = self.odd.get(kind, 0) + 1
             self.odd_examples.setdefault(kind, f"{segment}: {example}" if example else segment)
 
     @property
     def warning(self) -> str:
-        """What the user should hear; empty if nothing."""
+        """A warning for the user; empty if there is none."""
         if self.overlaps <= MANY * self.converted:
             return ""
         return (
@@ -82,22 +82,22 @@ class Report:
 
     @property
     def reasons(self) -> dict[str, int]:
-        """How often something was skipped for each reason, most frequent first."""
+        """The number of skips for each reason, most frequent first."""
         return dict(Counter(skip.reason for skip in self.skipped).most_common())
 
     @property
     def problems(self) -> dict[str, int]:
-        """How often something was skipped for each reason but the paper's exclusions."""
+        """The number of skips for each reason but the paper's exclusions."""
         return dict(Counter(skip.reason for skip in self.skipped if not skip.exclusion).most_common())
 
     @property
     def exclusions(self) -> dict[str, int]:
-        """Sound segments left out under each of the exclusions, all of which are listed."""
+        """The number of sound segments left out under each of the exclusions, all of which are listed."""
         found = Counter(skip.exclusion for skip in self.skipped)
         return {name: found[name] for name in EXCLUSIONS}
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as kept with the store."""
+        """Return the report as kept with the store."""
         skipped = [skip.to_json() for skip in self.skipped]
         return {**vars(self), "skipped": skipped, "exclusions": self.exclusions, "reasons": self.reasons}
 

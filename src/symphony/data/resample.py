@@ -29,7 +29,7 @@ REPEATED = "frames left out: not after those before them"
 
 
 def resample(segment: RunSegment, dt: float) -> RunSegment:
-    """The same valid segment with steps of ``dt`` seconds, beginning at the same moment.
+    """Return a valid segment with steps of ``dt`` seconds, beginning at the same moment.
 
     Where ``dt`` is a whole multiple of the segment's own step (10 Hz to 5 Hz), steps are picked and nothing is
     computed; a light unknown at a picked step has the latest state known since the one before (some WOMD records
@@ -59,7 +59,7 @@ def _pick(segment: RunSegment, every: int, dt: float) -> RunSegment:
 
 
 def hold_lights(segment: RunSegment) -> RunSegment:
-    """Lights with the last state that the log knows, where it knows none, and with the first before that.
+    """Give lights the last state that the log knows, where it knows none, and the first one before that.
 
     For logs that show lights at a single step: an agent that has never met an unknown light may wait at it for ever.
     """
@@ -86,11 +86,11 @@ def _interpolate(segment: RunSegment, ratio: float, dt: float) -> RunSegment:
 
 
 def evened(segment: RunSegment, times: Doubles) -> RunSegment:
-    """A segment whose steps were logged at uneven times, brought to steps of its ``dt`` from the first on.
+    """Return a segment logged at uneven times with even steps of its ``dt``, from the first on.
 
     Frames within a tenth of a step are taken as they are. What lies between two frames is interpolated as in
-    :func:`resample`; inside a gap of more than :data:`MAX_GAP` seconds nobody is seen. Frames that do not come after
-    those before them are left out. What was done is noted (see :mod:`symphony.data.odd`).
+    :func:`resample`; inside a gap of more than :data:`MAX_GAP` seconds no agent is valid. Frames that do not come
+    after those before them are left out. What was done is noted (see :mod:`symphony.data.odd`).
 
     Takes the times [T] of its steps in seconds; its ``dt`` is the usual time between two frames.
     """
@@ -120,7 +120,7 @@ def evened(segment: RunSegment, times: Doubles) -> RunSegment:
 
 
 def _between(segment: RunSegment, before: Ints, after: Ints, share: Doubles) -> RunSegment:
-    """States and lights at moments [U] between two steps each; an agent is valid where it is at both."""
+    """Return the states and lights at moments [U] between two steps each; an agent is valid where it is at both."""
     valid = segment.valid[:, before] & segment.valid[:, after]
 
     def between(array: NDArray[Any]) -> Doubles:
@@ -145,7 +145,7 @@ def smooth(segment: RunSegment, sigma: float) -> RunSegment:
     positions with Gaussian weights in time (standard deviation ``sigma`` seconds), out to 4 sigma. Inside a track it
     is a Gaussian filter; unlike one it does not pull a moving agent inwards at the ends of its track or beside gaps.
     Above 2 m/s the heading becomes the direction of motion (or its opposite, for an agent that reverses), below 1 m/s
-    it is the logged one, smoothed, in between something between. A track of one valid step stays as it is.
+    it is the logged one, smoothed, in between a mixture of both. A track of one valid step stays as it is.
     """
     if not 0 < sigma <= MAX_SIGMA:
         raise ConfigError(f"sigma must be positive and at most {MAX_SIGMA:g} s, is {sigma}")
@@ -166,7 +166,7 @@ def smooth(segment: RunSegment, sigma: float) -> RunSegment:
 
 
 def local_line(values: Doubles, valid: Bools, dt: float, sigma: float) -> tuple[Doubles, Doubles, Bools]:
-    """(value, slope, where a line could be fitted) at each step, of values [A, T, D]; values elsewhere."""
+    """Return (value, slope, whether a line could be fitted) at each step of values [A, T, D]; else the values."""
     there = valid.astype(np.float64)
     # Offsets from the agent's mean keep the sums small, so that nothing is lost to cancellation.
     total = np.maximum(there.sum(axis=1), 1)[:, None, None]
@@ -186,7 +186,7 @@ def local_line(values: Doubles, valid: Bools, dt: float, sigma: float) -> tuple[
 
 
 def _moments(there: Doubles, masked: Doubles, rows: slice, dt: float, sigma: float) -> tuple[Doubles, ...]:
-    """Weighted sums around some steps: of 1, lag and lag squared [A, rows]; of values, and by lag [A, rows, D]."""
+    """Return weighted sums about some steps: of 1, lag, lag squared [A, rows]; of values, and by lag [A, rows, D]."""
     steps, columns = np.arange(there.shape[1]), slice(None)
     if rows != slice(0, len(steps)):  # a long log: what is out of the window's reach is left out
         reach = int(min(4 * sigma / dt + 1, len(steps)))
@@ -199,7 +199,7 @@ def _moments(there: Doubles, masked: Doubles, rows: slice, dt: float, sigma: flo
 
 
 def _unwrapped(heading: Doubles, valid: Bools) -> Doubles:
-    """[A, T] headings without jumps of 2π between an agent's successive valid steps."""
+    """Return [A, T] headings without jumps of 2π between an agent's successive valid steps."""
     result = heading.copy()
     for agent in np.flatnonzero(valid.any(axis=1)):
         result[agent, valid[agent]] = np.unwrap(heading[agent, valid[agent]])

@@ -63,7 +63,7 @@ STATES = ("position", "heading", "velocity", "valid")  # a row for each agent, a
 
 
 class AgentType(IntEnum):
-    """What a track is (WOMD's numbering)."""
+    """The type of a track (WOMD's numbering)."""
 
     UNSET = 0
     VEHICLE = 1
@@ -73,7 +73,7 @@ class AgentType(IntEnum):
 
 
 class LaneType(IntEnum):
-    """What a lane is (WOMD's numbering)."""
+    """The type of a lane (WOMD's numbering)."""
 
     UNDEFINED = 0
     FREEWAY = 1
@@ -82,7 +82,7 @@ class LaneType(IntEnum):
 
 
 class MarkType(IntEnum):
-    """Map features that are neither lanes nor road boundary."""
+    """The type of a map feature that is neither a lane nor road boundary."""
 
     UNDEFINED = 0
     ROAD_LINE = 1
@@ -93,7 +93,7 @@ class MarkType(IntEnum):
 
 
 class SignalState(IntEnum):
-    """State of a traffic light for one lane (WOMD's numbering)."""
+    """The state of a traffic light for one lane (WOMD's numbering)."""
 
     UNKNOWN = 0
     ARROW_STOP = 1
@@ -115,7 +115,7 @@ class Polylines:
 
     @classmethod
     def of(cls, lines: Sequence[NDArray[Any]]) -> Polylines:
-        """Build from arrays [P_k, 2 or 3], one per line."""
+        """Build polylines from arrays [P_k, 2 or 3], one per line."""
         arrays = [np.asarray(line, dtype=np.float32).reshape(len(line), -1) for line in lines]
         arrays = [a if a.shape[1] == 3 else np.pad(a, ((0, 0), (0, 1))) for a in arrays]
         offsets = np.cumsum([0, *(len(a) for a in arrays)], dtype=np.int64)
@@ -220,7 +220,7 @@ class RunSegment:
         return self.logged or self.num_steps
 
     def replace(self, **changes: Any) -> RunSegment:
-        """A copy with some fields changed."""
+        """Return a copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 
 
@@ -364,13 +364,13 @@ def _array(
 
 
 def jumps(s: RunSegment) -> NDArray[np.float64]:
-    """[A, T - 1] metres from each step to the next, 0 where an agent is not valid at both."""
+    """Return [A, T - 1] metres from each step to the next, 0 where an agent is not valid at both."""
     way = np.hypot(*np.moveaxis(np.diff(s.position[..., :2].astype(np.float64), axis=1), -1, 0))
     return np.where(s.valid[:, 1:] & s.valid[:, :-1], way, 0.0)
 
 
 def line_lengths(lines: Polylines) -> NDArray[np.float64]:
-    """[K] metres of each line."""
+    """Return [K] metres, the length of each line."""
     sides = np.hypot(*np.diff(lines.points[:, :2].astype(np.float64), axis=0).T)
     owner = lines.line_index
     within = owner[1:] == owner[:-1]
@@ -378,7 +378,7 @@ def line_lengths(lines: Polylines) -> NDArray[np.float64]:
 
 
 def largest(array: NDArray[Any]) -> float:
-    """Return the largest magnitude; 0 of no numbers."""
+    """Return the largest magnitude; 0 if there are no numbers."""
     return float(np.abs(array).max(initial=0))
 
 

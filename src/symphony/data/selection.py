@@ -1,4 +1,4 @@
-"""Who is interactive in a segment, and which segments are left out (paper, section V-A)."""
+"""The choice of the interactive agents of a segment, and of segments to leave out (paper, section V-A)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TILE = 1_000_000  # pairs of steps that are compared at a time
 
 
 class Context(StrEnum):
-    """Why the partner of the ego was chosen; the later ones say what it is to the ego. Best first."""
+    """The reason for the choice of the ego's partner, best first; the later ones are its relations to the ego."""
 
     INTEREST = "interest"  # the source marks it as interacting (WOMD: objects of interest)
     PREDICT = "predict"  # the source marks it for prediction (WOMD: tracks to predict)
@@ -41,9 +41,9 @@ class Context(StrEnum):
 
 
 class Relations(NamedTuple):
-    """What each of K vehicles is to the ego: seconds [K] between the two, infinite where it is not.
+    """The relations of K vehicles to the ego: seconds [K] between the two, infinite where there is no such relation.
 
-    Where their paths become one, where they cross, the smallest time gap to it and from it on the path in common.
+    They are taken where paths merge, where they cross, and as the smallest time gap ahead and behind on one path.
     """
 
     merge: Reals
@@ -114,9 +114,9 @@ class _Meeting:
 
 
 def _places(segment: RunSegment, others: Rows, steps: slice, spacing: Reals) -> tuple[Reals, Bools, Bools]:
-    """Each of the ego's steps [t] with each of the others' [k, t, T].
+    """Compare each of the ego's steps [t] with each of the others' [k, t, T].
 
-    Gives metres the ego is ahead, whether both are at one place the same way, and whether both are there at an angle.
+    Returns metres the ego is ahead, whether both are in one place the same way, and whether at an angle.
     """
     ego, position = segment.ego, segment.position[..., :2]
     delta = position[ego, None, steps, None] - position[others][:, None]
@@ -133,13 +133,13 @@ def _places(segment: RunSegment, others: Rows, steps: slice, spacing: Reals) -> 
 
 
 def _turned(delta: Reals, heading: Reals) -> tuple[Reals, Reals]:
-    """Parts of vectors [..., 2] along headings and to their left."""
+    """Return the parts of vectors [..., 2] along headings and to their left."""
     cos, sin = np.cos(heading), np.sin(heading)
     return cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]
 
 
 def _spacing(position: Reals, valid: Bools) -> Reals:
-    """[..., T] half the way from the step before plus half the way to the next, in metres."""
+    """Return [..., T] half the way from the step before plus half the way to the next, in metres."""
     sides = np.linalg.norm(np.diff(position, axis=-2), axis=-1)
     sides = np.where(valid[..., 1:] & valid[..., :-1], sides, 0)
     padded = np.concatenate([sides[..., :1], sides, sides[..., -1:]], -1)
@@ -147,7 +147,7 @@ def _spacing(position: Reals, valid: Bools) -> Reals:
 
 
 def _boxes_meet(segment: RunSegment, others: Rows) -> Bools:
-    """[K] whether the boxes around the two paths come close: cheap, and leaves few."""
+    """Return [K] whether the boxes around the two paths come close: cheap, and leaves few."""
     position, valid = segment.position[..., :2], segment.valid[..., None]
     rows = np.append(others, segment.ego)
     low = np.where(valid[rows], position[rows], np.inf).min(1) - HALF_LANE
@@ -156,7 +156,7 @@ def _boxes_meet(segment: RunSegment, others: Rows) -> Bools:
 
 
 def _queue_gap(segment: RunSegment, others: Rows, sign: int) -> Reals:
-    """[K] smallest time gap kept for a while by two in one lane at the same step; infinite if they don't.
+    """Return [K] the smallest time gap that two in one lane keep for a while; infinite if they never are in one.
 
     In a queue, paths in common are too short to tell and time gaps grow without limit: there the distance counts,
     as if the one behind drove ``QUEUE_SPEED``. The sign is -1 for those ahead of the ego, 1 for those behind it.
@@ -174,7 +174,7 @@ def _queue_gap(segment: RunSegment, others: Rows, sign: int) -> Reals:
 
 
 def _merge_gap(segment: RunSegment, other: int, mine: int, theirs: int) -> float:
-    """Seconds between the ego and another where their paths become one; infinite if they always were one.
+    """Return the seconds between the ego and another where their paths become one; infinite if they always were one.
 
     Both paths are followed backwards from that place by the same distances: they must have been apart or at an angle.
     """
@@ -188,7 +188,7 @@ def _merge_gap(segment: RunSegment, other: int, mine: int, theirs: int) -> float
 
 
 def _way_back(segment: RunSegment, agent: int, step: int) -> Reals:
-    """[4, n] distance driven since, x, y and heading at the logged steps from one back to the first."""
+    """Return [4, n] distance driven since, x, y and heading at the logged steps from one back to the first."""
     steps = np.flatnonzero(segment.valid[agent, : step + 1])[::-1]
     position = segment.position[agent, steps, :2].astype(np.float64)
     heading = np.unwrap(segment.heading[agent, steps].astype(np.float64))
@@ -209,7 +209,7 @@ MOVING = 2.0  # metres of logged travel past which an agent counts as moving
 
 
 def travel(segment: RunSegment) -> NDArray[np.float32]:
-    """[A] the farthest each agent gets from where it is first seen, in metres.
+    """Return [A] the farthest each agent gets from where it is first seen, in metres.
 
     A distance, not a path length: the jitter of a parked car's track does not add up.
     """
@@ -236,8 +236,8 @@ def interactive_choice(segment: RunSegment, count: int, *, fewer: bool = False) 
     step, and agents seen at every step (which can be compared with the log throughout) go before the others, whatever
     their context.
 
-    Raises a :class:`DataError` if there is no ego, or there are not as many (N_I, 2 or 8 in the paper); ``fewer``
-    takes those that there are.
+    Raises a :class:`DataError` if there is no ego, or there are fewer than ``count`` (N_I, 2 or 8 in the paper); with
+    ``fewer`` those are taken.
     """
     seen = segment.valid[:, 0] & (segment.agent_type == AgentType.VEHICLE)
     others = seen & (np.arange(segment.num_agents) != segment.ego)
@@ -257,7 +257,7 @@ def interactive_choice(segment: RunSegment, count: int, *, fewer: bool = False) 
 
 
 def named_vehicles(segment: RunSegment, ids: Sequence[int]) -> list[int]:
-    """The rows of vehicles beside the ego by their ids; a DataError if one is not seen at the first step."""
+    """Return the rows of vehicles besides the ego by their ids; a DataError if one is not seen at the first step."""
     found = [int(row) for agent in ids for row in np.flatnonzero(segment.agent_id == agent)]
     free = (segment.agent_type[found] == AgentType.VEHICLE) & segment.valid[found, 0]
     if len(found) < len(ids) or segment.ego in found or not free.all():
@@ -268,12 +268,12 @@ def named_vehicles(segment: RunSegment, ids: Sequence[int]) -> list[int]:
 
 
 def interactive_agents(segment: RunSegment, count: int) -> NDArray[np.int64]:
-    """[count] the agents of :func:`interactive_choice`, the ego first."""
+    """Return [count] the agents of :func:`interactive_choice`, the ego first."""
     return interactive_choice(segment, count).agents
 
 
 def choices(segments: Iterable[RunSegment], count: int) -> dict[str, Any]:
-    """The choices in many segments, as JSON can hold them.
+    """Return the choices in many segments, in types that JSON can hold.
 
     That is ``count``; ``contexts``: how many segments have a partner of each :class:`Context`; ``too_few``: how many
     have fewer vehicles; ``segments``: by segment id the ``context`` and the ``agents`` (the source's ids).
@@ -292,7 +292,7 @@ def choices(segments: Iterable[RunSegment], count: int) -> dict[str, Any]:
 
 
 def _partner(segment: RunSegment, others: Rows, moves: Rows) -> tuple[int | None, Context | None]:
-    """The ego's partner among others and those of them that move, both in the order of preference."""
+    """Return the ego's partner and why; others, and those of them that move, are given in order of preference."""
     marks = ((others, segment.interest, Context.INTEREST), (moves, segment.predict, Context.PREDICT))
     for group, wanted, context in marks:
         marked = group[np.isin(group, wanted)]
@@ -313,7 +313,7 @@ def _partner(segment: RunSegment, others: Rows, moves: Rows) -> tuple[int | None
 
 
 def road_points(segment: RunSegment) -> int:
-    """Points of lanes, boundary and markings once each line has one at least every 2 m.
+    """Return the number of points of lanes, boundary and markings once each line has one at least every 2 m.
 
     Raw logs differ in density (WOMD: 0.5 m), so the paper's limit is applied to this number.
     """
@@ -322,7 +322,7 @@ def road_points(segment: RunSegment) -> int:
 
 
 def exclusion(segment: RunSegment, count: int) -> tuple[str, DataError] | None:
-    """The first of the paper's :data:`EXCLUSIONS` that applies to a segment and an error that says why; None if none.
+    """Return the first of the paper's :data:`EXCLUSIONS` that applies, and an error that says why; None if none does.
 
     Playback agents are those seen at some step but for the ``count`` interactive ones that a segment must have at its
     first step; for roadgraph points see :func:`road_points`.

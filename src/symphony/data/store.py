@@ -167,7 +167,7 @@ class SegmentStore(Sequence[RunSegment]):
 
     @cached_property
     def sources(self) -> NDArray[np.str_]:
-        """[segments] :attr:`RunSegment.source` of each."""
+        """[segments] The :attr:`RunSegment.source` of each."""
         return np.array(self._texts("source"), np.str_)
 
     @cached_property
@@ -196,7 +196,7 @@ class SegmentStore(Sequence[RunSegment]):
         return {name: i for i, name in enumerate(self.ids)}
 
     def index_of(self, segment_id: str | int) -> int:
-        """Return the index of a segment by its id, or by its number, which it is; :class:`DataError` if none is."""
+        """Return the index of a segment by its id or its number; a :class:`DataError` if there is none."""
         if isinstance(segment_id, int) and 0 <= segment_id < len(self):
             return segment_id
         if segment_id not in self._places:
@@ -222,7 +222,7 @@ class SegmentStore(Sequence[RunSegment]):
 
     @property
     def unfinished(self) -> str | None:
-        """That its generation is still under way, or was interrupted: how many segments there are, of how many."""
+        """A message if its generation is under way or was interrupted: how many segments there are, of how many."""
         found = [self.report.get(name) for name in ("generation", "settings")]
         made, settings = (each if isinstance(each, dict) else {} for each in found)
         if made.get("complete") is not False:
@@ -247,7 +247,7 @@ class SegmentStore(Sequence[RunSegment]):
     def verify(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Read everything, and compare it with the hashes and the schema; the tags must be JSON.
 
-        A :class:`DataError` names the first segment that is not what was written. ``progress`` hears done and total.
+        A :class:`DataError` names the first segment that has changed. ``progress`` gets done and total.
         """
         for number, key in enumerate(self.map_hashes):
             if content_hash(self.road(number)) != key.hex():
@@ -294,14 +294,14 @@ def _group(tags: dict[str, Any], segment_id: str) -> str:
 
 
 def _span(values: NDArray[Any]) -> dict[str, float]:
-    """Smallest, mean and largest, to a microsecond; empty for no values."""
+    """Return the smallest, mean and largest value, to a microsecond; empty for no values."""
     if len(values) == 0:
         return {}
     return {"min": values.min().item(), "mean": round(float(values.mean()), 6), "max": values.max().item()}
 
 
 def _read_indices(folder: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Records of the segments, and of the maps they lie on, memory-mapped.
+    """Return records of the segments, and of the maps they lie on, memory-mapped.
 
     A :class:`DataError` says if an index is missing, cut short or contradicts itself.
     """
@@ -332,7 +332,7 @@ def _check_sound(sound: NDArray[np.bool_], table: Table, folder: Path) -> None:
 
 
 def _read_index(folder: Path, table: Table, limit: int | None) -> NDArray[Any]:
-    """The complete records of an index; a torn last record is not one. With a limit there must be as many."""
+    """Return the complete records of an index; a torn last record is not one. With a limit there must be as many."""
     path = table.index_path(folder)
     if not path.is_file():
         raise DataError("index file is missing", file=path)
@@ -349,7 +349,7 @@ def _read_index(folder: Path, table: Table, limit: int | None) -> NDArray[Any]:
 
 
 def _mapped(path: Path, row: np.dtype[Any], rows: int) -> NDArray[Any]:
-    """A read-only view of the start of a file (an empty file can't be mapped)."""
+    """Return a read-only view of the start of a file (an empty file can't be mapped)."""
     if rows == 0:
         return np.zeros(0, row)
     # Not np.memmap, which asks the disk for every folder on the way to each file, and is slow to slice.

@@ -76,7 +76,7 @@ class Table:
         return folder / f"{self.name}.idx"
 
     def ends(self, records: NDArray[Any]) -> NDArray[np.int64]:
-        """[axes] rows in use on each axis."""
+        """Return [axes] the rows in use on each axis."""
         if len(records) == 0:
             return np.zeros(len(self.axes), np.int64)
         return np.asarray(records[-1]["begin"] + records[-1]["count"], np.int64)
@@ -164,5 +164,5 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def lock(folder: Path) -> Lock:
-    """Keep other writers out of a folder until this is closed; a :class:`DataError` if one is in there."""
+    """Keep other writers out of a folder until this is closed; a :class:`DataError` if there is one."""
     return Lock(folder / LOCK)

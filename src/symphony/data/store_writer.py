@@ -22,7 +22,7 @@ from symphony.files import Lock, naming, write_json
 
 
 class StoreWriter(AbstractContextManager["StoreWriter"]):
-    """Adds segments to a store, one at a time; each is on record once :meth:`append` returns.
+    """Adds segments to a store, one at a time; each is stored once :meth:`append` returns.
 
     Its folder is created, or must be empty unless an existing store is continued (``append``): then what a writer
     that died left unfinished is cut off. A :class:`DataError` says if the folder holds something else, is damaged, of
@@ -122,7 +122,7 @@ class StoreWriter(AbstractContextManager["StoreWriter"]):
         write_json(self.path / layout.REPORT, report)
 
     def close(self) -> None:
-        """Bring everything to the disk and let the next writer in."""
+        """Flush everything to disk and let the next writer in."""
         if self._lock is not None:
             self._maps.close()
             self._segments.close()
@@ -174,7 +174,7 @@ class _TableWriter:
             self._files[column.name].truncate(int(end[self.table.axes[column.axis]]) * column.row.itemsize)
 
     def close(self) -> None:
-        """Bring everything to the disk, columns before the index, and write no more."""
+        """Flush everything to disk, columns before the index, and write no more."""
         self._trim()
         for file in (*self._files.values(), self._index):
             with naming(Path(file.name)):
@@ -191,14 +191,14 @@ def _write_at(file: BinaryIO, offset: int, array: NDArray[Any]) -> None:
 
 
 def _plain(segment: RunSegment) -> RunSegment:
-    """Python scalars and text in place of NumPy's, which would enter the content hash."""
+    """Return Python scalars and text in place of NumPy's, which would enter the content hash."""
     texts = {name: str(getattr(segment, name)) for name in ("segment_id", "source", "file")}
     numbers = {"dt": float(segment.dt), "ego": int(segment.ego), "current_step": int(segment.current_step)}
     return segment.replace(**texts, **numbers)
 
 
 def _is_blank(path: Path) -> bool:
-    """Whether nothing is there, or only the empty files of a writer that died before it had begun."""
+    """Return whether nothing is there, or only the empty files of a writer that died before it had begun."""
     if not path.is_dir():
         return not path.exists()
     draft = f".{Path(layout.HEADER).stem}."
@@ -212,7 +212,7 @@ def _is_blank(path: Path) -> bool:
 
 
 def _create(path: Path) -> None:
-    """Empty files first and the header last: with a header, a store is whole."""
+    """Create empty files first and the header last: with a header, a store is whole."""
     (path / layout.COLUMNS).mkdir(exist_ok=True)
     for table in layout.TABLES:
         for file in (table.index_path(path), *(c.path(path) for c in table.columns)):

@@ -1,4 +1,4 @@
-"""The driving environment: dynamics, observation, who drives whom."""
+"""The driving environment: dynamics, observation, routes, scenes and the interactive agents."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The driving environment: interactive agents act, everyone else is played back from the log."""
+"""The driving environment: interactive agents act, all others are played back from the log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NO_GOALS = "agents observe routes and follow none: TransformedEnv(env, RouteGoal
 
 
 def penalty(before: TensorDictBase, after: TensorDictBase) -> Float[Tensor, "*b N"]:
-    """Reward of -1 for an agent that collides, is off the road or nowhere (see :class:`DrivingEnv`), else 0."""
+    """Return the reward: -1 for an agent that collides or is off the road or nowhere, else 0."""
     bad = after.get(keys.COLLISION) | after.get(keys.OFFROAD)
     state = after.get(keys.STATE)
     return -(bad.squeeze(-1) | _nowhere(state, after.get(keys.VALID))).to(state.dtype)
@@ -43,7 +43,7 @@ def _nowhere(state: Float[Tensor, "*b N 4"], valid: Bool[Tensor, "*b N"]) -> Boo
 
 
 class State(NamedTuple):
-    """The simulation state, all of it; leading dimensions [*b] are those of the batch."""
+    """The complete simulation state; leading dimensions [*b] are those of the batch."""
 
     scene: Tensor  # [*b] rows of the scene batch
     step: Tensor  # [*b] simulated steps since the first state
@@ -58,14 +58,14 @@ class State(NamedTuple):
 class DrivingEnv(EnvBase):
     """A batch of logged scenes in which N agents are driven by actions (paper, section III).
 
-    All simulation state is in the TensorDict: which scene (``scene``), the step, the rollout's identity
-    (``stream``), the state of the interactive agents and the routes they follow. The environment holds only
-    constants, so forking a branch is an index and one instance serves every batch shape. Where the scenes say where
-    their maps end, traffic is open: agents enter where the log brings them in, once there is room for them (they wait
-    beside the road), and leave at the edge of the map; who is not there is not ``valid``. An episode ends at the last
-    logged step (``truncated``), or at what ``ends_on`` names (``terminated``). An action that is not finite leaves
-    its agent nowhere, which ends the episode, too (``terminated``): no step waits for a device to tell. Simulations
-    with an agent's networks raise an error at their end that names agent and step (:class:`NotFiniteError`).
+    All simulation state is in the TensorDict: which scene (``scene``), the step, the rollout's identity (``stream``),
+    the state of the interactive agents and the routes they follow. The environment holds only constants, so forking a
+    branch is an index and one instance serves every batch shape. Where the scenes say where their maps end, traffic
+    is open: agents enter where the log brings them in, once there is room for them (they wait beside the road), and
+    leave at the edge of the map; absent agents are not ``valid``. An episode ends at the last logged step
+    (``truncated``), or at what ``ends_on`` names (``terminated``). An action that is not finite leaves its agent
+    nowhere, which also ends the episode (``terminated``), so that no step waits for a device. Simulations with an
+    agent's networks raise an error at their end that names agent and step (:class:`NotFiniteError`).
 
     Args:
         scenes: static data of B segments, all with the same number of interactive agents; or a source, from which
@@ -145,7 +145,7 @@ class DrivingEnv(EnvBase):
 
     @property
     def scenes(self) -> SceneBatch:
-        """The scenes at hand.
+        """The current scenes.
 
         Raises a :class:`ConfigError` before the first reset of an environment that draws from a source.
         """
@@ -203,7 +203,7 @@ class DrivingEnv(EnvBase):
             self._rng.manual_seed(seed)
 
     def to(self, device: torch.device | str | int) -> DrivingEnv:
-        """Move the environment, its scenes included."""
+        """Move the environment and its scenes to a device."""
         moved = super().to(device)
         if moved._scenes is not None and moved._scenes.log_state.device != moved.device:
             moved.scenes = moved.scenes.to(moved.device)
@@ -212,8 +212,8 @@ class DrivingEnv(EnvBase):
     def compile(self, *args: Any, **kwargs: Any) -> None:
         """Compile the step in place, as :meth:`torch.nn.Module.compile` compiles a forward pass.
 
-        This saves the calls of small operators, of which a step of few agents consists; with many it loses. Copies of
-        the environment are not compiled. The default backend of :func:`torch.compile` needs a C++ compiler.
+        This saves the calls of small operators, of which a step of few agents consists; with many it is slower.
+        Copies of the environment are not compiled. The default backend of :func:`torch.compile` needs a C++ compiler.
         """
         step = torch.compile(type(self)._step.__get__(self), *args, **kwargs)
         self._step = step  # type: ignore[method-assign]
@@ -227,10 +227,10 @@ class DrivingEnv(EnvBase):
         rollout: Int[Tensor, "*b"] | int = 0,
         goal: Int[Tensor, "*b N"] | None = None,
     ) -> TensorDict:
-        """State at the first logged step, as :meth:`reset` returns it.
+        """Return the state at the first logged step, as :meth:`reset` returns it.
 
         The shape of ``scene``, rows of the scene batch, is the batch size. The number of a ``rollout`` (branch,
-        repetition) within its scene lets each draw numbers of its own whatever batch it runs in. Goals are the routes
+        repetition) within its scene lets each draw its own numbers, whatever batch it runs in. Goals are the routes
         that agents follow; by default none.
         """
         rollout = torch.as_tensor(rollout, device=scene.device).expand(scene.shape)
@@ -243,13 +243,13 @@ class DrivingEnv(EnvBase):
         return self._from_state(start if goal is None else self._following(start, goal))
 
     def _first(self, scene: Int[Tensor, "*b"]) -> Float[Tensor, "*b N 4"]:
-        """The states in which agents begin; those that enter later begin where the log has them then."""
+        """Return the states in which agents begin; those that enter later begin where the log has them then."""
         row, index, enter = scene[..., None], self.scenes.interactive[scene], self.scenes.enter[scene]
         first = with_speed(self.scenes.log_state[row, enter, index])
         return torch.cat([first[..., :3], first[..., 3:].clamp_min(0.0)], -1)
 
     def at(self, state: TensorDictBase) -> TensorDict:
-        """Observation and flags of given simulation states (what ``state_spec`` lists), ended ones included."""
+        """Return observation and flags of simulation states (of ``state_spec``), ended ones included."""
         return self._from_state(self._read(state))
 
     def choices(self, state: TensorDictBase) -> TensorDictBase:
@@ -265,7 +265,7 @@ class DrivingEnv(EnvBase):
         return state.set(keys.ROUTES_MASK, mask.reshape(*row.shape, *mask.shape[1:]))
 
     def with_goals(self, state: TensorDictBase, goal: Int[Tensor, "*b N"] | None = None) -> TensorDict:
-        """A start state whose agents follow the given routes (by default those nearest to the log)."""
+        """Return a start state whose agents follow the given routes (by default those nearest to the log)."""
         start = self._read(state)
         goal = self.scenes.route_logged[start.scene] if goal is None else goal
         return self._from_state(self._following(start, goal))
@@ -296,7 +296,7 @@ class DrivingEnv(EnvBase):
         return torch.where(partial.squeeze(-1), fresh, kept)
 
     def _draw(self, shape: torch.Size, *, renew: bool) -> Int[Tensor, "*b"]:
-        """Rows of the scenes that a batch starts, those at hand or new ones of a source."""
+        """Return the rows of the scenes that a batch starts, current ones or new ones of a source."""
         if self.source is None or (not renew and self._scenes is not None):
             return torch.randint(len(self.scenes), tuple(shape), generator=self._rng)
         items = self.source.draw(shape.numel(), self._rng)
@@ -335,7 +335,7 @@ class DrivingEnv(EnvBase):
 
     @torch.no_grad()
     def _progress(self, before: State, after: Float[Tensor, "*b N 4"]) -> Float[Tensor, "*b N"]:
-        """Metres [..., N] that agents have come along their routes, from where they were before."""
+        """Return metres [..., N] that agents have come along their routes, from where they were before."""
         if self.scenes.route_point.shape[1] == 0:
             return before.progress
         old, new, goal, about = _flat(before.scene.ndim, before.state, after, before.goal, before.progress)
@@ -344,13 +344,13 @@ class DrivingEnv(EnvBase):
         return routes.progress(new[..., :2], about, moved).reshape(before.progress.shape)
 
     def _moved(self, tensordict: TensorDictBase, state: Tensor, size: Tensor) -> Float[Tensor, "*b N 4"]:
-        """The agents [..., N, 4] a step later, boxes [..., N, 2]."""
+        """Return the agents [..., N, 4] a step later, boxes [..., N, 2]."""
         return self.dynamics.step(state, tensordict.get(keys.ACTION), size, self.dt)
 
     def _flow(
         self, scene: Tensor, step: Tensor, before: Tensor, after: Tensor, valid: Tensor, waiting: Tensor
     ) -> tuple[Bool[Tensor, "*b N"], Bool[Tensor, "*b N"]]:
-        """Who is there after a step [..., N], and who waits: those that have left do neither."""
+        """Return which agents [..., N] are present after a step, and which wait; those that have left do neither."""
         row, at = scene.flatten(), step.flatten()
         old, new, there, waits = _flat(scene.ndim, before, after, valid, waiting)
         gone = leaving(old[..., :2], new[..., :2], self.scenes.exits[row], self.scenes.hull[row])
@@ -365,7 +365,7 @@ class DrivingEnv(EnvBase):
         return there.reshape(valid.shape), waits.reshape(valid.shape)
 
     def objects(self, row: Tensor, step: Tensor, state: Tensor, valid: Tensor) -> Objects:
-        """Everyone at logged steps of scenes ``row``: agents that are ``valid`` in their states, others as logged."""
+        """Return all objects at logged steps of scenes ``row``: ``valid`` agents in their states, others logged."""
         return everyone_at(self.scenes, row, step, state, valid)
 
     def _read(self, tensordict: TensorDictBase) -> State:
@@ -375,7 +375,7 @@ class DrivingEnv(EnvBase):
         return State(scene, step, stream, state, valid, goal, progress, waiting)
 
     def _from_state(self, now: State) -> TensorDict:
-        """Observation, flags and end of the episode, all functions of the simulation state."""
+        """Return observation, flags and end of the episode, all functions of the simulation state."""
         scenes, shape = self.scenes, now.scene.shape
         row, at = now.scene.flatten(), now.step.flatten()
         moved, real, goal, progress = _flat(len(shape), now.state, now.valid, now.goal, now.progress)
@@ -417,17 +417,17 @@ class DrivingEnv(EnvBase):
         return TensorDict(whole, batch_size=shape, device=self.device)
 
     def _kept(self) -> Tables:
-        """What is looked up at each step of the present scenes."""
+        """Return the tables of the current scenes that each step looks up."""
         if self._tables is None or self._tables.scenes is not self.scenes:
             self._tables = Tables(self.scenes, self.observation)
         return self._tables
 
 
 def _flat(ndim: int, *values: Tensor) -> list[Tensor]:
-    """Values whose first so many dimensions are one."""
+    """Return the values with their first ``ndim`` dimensions flattened into one."""
     return [value.reshape(-1, *value.shape[ndim:]) for value in values]
 
 
 def _of(table: Shaped[Tensor, "B ..."], scene: Int[Tensor, "*b"]) -> Shaped[Tensor, "*_"]:
-    """table[scene], which does not compile where a single scene is a number, that is, without dimensions."""
+    """Return table[scene], which would not compile for a single scene as a number without dimensions."""
     return table.index_select(0, scene.flatten()).reshape((*scene.shape, *table.shape[1:]))

@@ -33,7 +33,7 @@ Reals = Float[Tensor, "*#b"]
 
 
 def bicycle_step(state: States, acceleration: Reals, steering: Reals, length: Reals, dt: float) -> States:
-    """One step of the kinematic bicycle about the box centre.
+    """Advance the kinematic bicycle about the box centre by one step.
 
     With slip angle tan(beta) = tan(steering) / 2 (axles at equal distance from the centre), mean speed u of the
     step and wheelbase W: dheading = 2 u dt sin(beta) / W, and the centre moves u dt along heading +
@@ -51,7 +51,7 @@ def bicycle_step(state: States, acceleration: Reals, steering: Reals, length: Re
 
 
 def bicycle_inverse(state: States, after: States, length: Reals, dt: float) -> tuple[Reals, Reals]:
-    """Acceleration and steering that take the speed and heading of ``state`` to those of ``after``.
+    """Return acceleration and steering that take the speed and heading of ``state`` to those of ``after``.
 
     Exact where :func:`bicycle_step` produced ``after`` and the agent moved; steering is 0 at standstill and
     saturates at a turn no bicycle can make.
@@ -83,12 +83,12 @@ def displacement_step(state: States, displacement: Float[Tensor, "*#b 2"], lengt
 
 
 def displacement_inverse(state: States, after: States) -> Float[Tensor, "*b 2"]:
-    """The displacement in the frame of ``state`` that leads to the position of ``after`` (exact)."""
+    """Return the displacement in the frame of ``state`` that leads to the position of ``after`` (exact)."""
     return rotate(after[..., :2] - state[..., :2], -state[..., 2])
 
 
 def _quadratic(largest: float, count: int) -> list[float]:
-    """An odd number of values up to ``largest`` either way, dense about the middle one, which is exactly 0."""
+    """Return an odd number of values up to ``largest`` either way, dense about the middle one, which is exactly 0."""
     half = count // 2
     unit = (np.arange(count) - half).astype(np.float32) / np.float32(half)
     return (np.float32(largest) * (unit * np.abs(unit))).tolist()
@@ -128,12 +128,12 @@ class Bicycle:
 
     @property
     def num_actions(self) -> int:
-        """Number of joint actions."""
+        """Return number of joint actions."""
         return self.num_acceleration * self.num_steering
 
     def grid(self, like: Float[Tensor, "*_"]) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
-        """Acceleration and steering of every joint action, in the dtype and on the device of ``like``. Shared: not to
-        be changed in place.
+        """Return acceleration and steering of every joint action, in the dtype and on the device of ``like``. They
+        are shared and must not be changed in place.
         """
         acceleration, steering = self._joint
         return constant(acceleration, like.dtype, like.device), constant(steering, like.dtype, like.device)
@@ -141,7 +141,7 @@ class Bicycle:
     def step(
         self, state: Float[Tensor, "*b 4"], action: Int[Tensor, "*b"], size: Sizes, dt: float
     ) -> Float[Tensor, "*b 4"]:
-        """Apply joint action indices; one that is none is an IndexError."""
+        """Apply joint action indices; an invalid index is an IndexError."""
         # Not by brackets, for which -1 is the last one.
         acceleration, steering = (
             values.index_select(0, action.flatten()).reshape(action.shape) for values in self.grid(state)
@@ -152,11 +152,11 @@ class Bicycle:
     def fit(
         self, log: Float[Tensor, "*b T 4"], valid: Bool[Tensor, "*b T"], size: Sizes, dt: float
     ) -> tuple[Int[Tensor, "*b Tm1"], Float[Tensor, "*b T 4"]]:
-        """Greedy fit of logged states: at each step the action whose next state is nearest the logged one.
+        """Fit logged states greedily: at each step take the action whose next state is nearest the logged one.
 
-        Continues from the *fitted* state, so errors do not accumulate unseen. Where the next logged step is not
-        valid the agent keeps its speed and course, and where it reappears the fit starts anew from the log.
-        Gives joint action indices [*b, T - 1] and fitted states [*b, T, 4].
+        Continues from the *fitted* state, so errors do not accumulate unseen. Where the next logged step is not valid
+        the agent keeps its speed and course, and where it reappears the fit starts again from the log. Returns joint
+        action indices [*b, T - 1] and fitted states [*b, T, 4].
         """
         acceleration, steering = self.grid(log)
         effort = self.effort**2 * (acceleration.square() + (10.0 * steering).square())
@@ -178,7 +178,7 @@ class Bicycle:
         return _follow(torch.cat([log[..., :3], log[..., 3:].clamp_min(0.0)], -1), valid, nearest)
 
     def towards(self, state: States, after: States, size: Sizes, dt: float) -> Int[Tensor, "*b"]:
-        """The action whose next state is nearest to ``after``, a step of :func:`bicycle_step` away."""
+        """Return the action whose next state is nearest to ``after``, a step of :func:`bicycle_step` away."""
         pair = torch.stack([state, after], -2)
         return self.fit(pair, torch.ones_like(pair[..., 0], dtype=torch.bool), size, dt)[0].squeeze(-1)
 
@@ -200,7 +200,7 @@ class Displacement:
     def fit(
         self, log: Float[Tensor, "*b T 4"], valid: Bool[Tensor, "*b T"], size: Sizes, dt: float
     ) -> tuple[Float[Tensor, "*b Tm1 2"], Float[Tensor, "*b T 4"]]:
-        """Displacements that reach every valid logged position exactly; headings follow from the motion."""
+        """Return displacements that reach every valid logged position exactly; headings follow from the motion."""
 
         def exact(state: Tensor, target: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
             coast = torch.stack([state[..., 3] * dt, torch.zeros_like(state[..., 3])], -1)
@@ -210,7 +210,7 @@ class Displacement:
         return _follow(log, valid, exact)
 
     def towards(self, state: States, after: States, size: Sizes, dt: float) -> Float[Tensor, "*b 2"]:
-        """The action that leads to the heading and the speed of ``after``, a step of :func:`bicycle_step` away.
+        """Return the action that leads to heading and speed of ``after``, a step of :func:`bicycle_step` away.
 
         Not to its position, which is that of the mean speed: here the whole step has the speed after it. Exact unless
         the turn is too sharp for the distance: then the steepest step to that side, :data:`STEEPEST`.

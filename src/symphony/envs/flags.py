@@ -24,8 +24,8 @@ _PAIRS = 1 << 20  # positions times edges that are measured at a time where the 
 
 
 def collision_flags(objects: Objects, index: Int[Tensor, "M N"]) -> Bool[Tensor, "M N"]:
-    """Whether the oriented box of each agent ``index`` overlaps any other valid box on its level (touching does not
-    count).
+    """Return whether the oriented box of each agent ``index`` overlaps any other valid box on its level (touching
+    does not count).
     """
     state, size, other = objects.state.detach()[:, None], objects.size[:, None], objects.others(index)
     own, own_size = (rows_of(value[:, 0], index)[:, :, None] for value in (state, size))
@@ -48,10 +48,10 @@ def offroad_flags(
     tables: Tables | None = None,
     height: Float[Tensor, "M N 2"] | None = None,
 ) -> Bool[Tensor, "M N"]:
-    """Whether each box centre lies off the drivable area (nowhere, in a scene without boundary).
+    """Return whether each box centre lies off the drivable area (never in a scene without boundary).
 
     With ``tables``, which cost little to keep, the distance is measured only where a position's cell of the map does
-    not tell. With heights and levels, edges on other levels do not count.
+    not decide. With heights and levels, edges on other levels do not count.
     """
     if tables is None or height is not None or not on_host(position) or scenes.edge_start.shape[1] == 0:
         return road_distance(scenes, scene, position, tables, height) > 0
@@ -78,11 +78,11 @@ def road_distance(
     tables: Tables | None = None,
     height: Float[Tensor, "M K 2"] | None = None,
 ) -> Float[Tensor, "M K"]:
-    """Signed distance in metres to the edge of the drivable area, positive off the road.
+    """Return the signed distance in metres to the edge of the drivable area, positive off the road.
 
-    Differentiable in the position. With ``tables`` the nearest edge is looked for among those listed for the
-    position's cell of the map; the distance is the same within rounding. With heights and levels, edges on other
-    levels do not count (see :func:`symphony.geometry.levels_apart`).
+    Differentiable in the position. With ``tables`` the nearest edge is sought among those listed for the position's
+    cell of the map; the distance is the same within rounding. With heights and levels, edges on other levels do not
+    count (see :func:`symphony.geometry.levels_apart`).
     """
     if tables is None or not on_host(position) or not position.numel() or not scenes.edge_start.shape[1]:
         flat = _among_all(scenes, scene, position, scenes.edge_valid[scene])
@@ -113,7 +113,7 @@ def road_distance(
 def _nearest(
     tables: Tables, scene: Int[Tensor, " M"], position: Float[Tensor, "M K 2"]
 ) -> tuple[Int[Tensor, " R"], Bool[Tensor, " R"]]:
-    """The edge nearest to each position among those of all scenes, and whether its cell tells."""
+    """Return the edge nearest to each position among those of all scenes, and whether its cell decides."""
     x, y = np.ascontiguousarray(position.detach().reshape(-1, 2).numpy().T)
     cell = tables.edge_cells.at(scene.repeat_interleave(position.shape[1]).numpy(), x, y)
     nearest, known = np.zeros(len(cell), np.int64), np.flatnonzero(cell >= 0)

@@ -1,4 +1,4 @@
-"""Who is where at a step, who can enter, and what an agent observes of the nearest others.
+"""All objects at a step, which agents can enter, and what an agent observes of the nearest others.
 
 Shapes: M rows (any flattened batch), N observing agents, A agents of the scene, O objects.
 """
@@ -38,7 +38,7 @@ class Objects(NamedTuple):
     height: Tensor | None = None
 
     def others(self, index: Int[Tensor, "M N"]) -> Bool[Tensor, "M N A"]:
-        """Whom agents ``index`` can meet: everyone but themselves who is there, on their level."""
+        """Return which agents ``index`` can meet: all others that are present, on their level."""
         place = torch.arange(self.valid.shape[1], device=index.device)
         other = self.valid[:, None] & (place != index[..., None])
         if self.height is None:
@@ -61,7 +61,7 @@ class Observers(NamedTuple):
 
     @classmethod
     def of(cls, objects: Objects, scene: Tensor, step: Tensor, index: Tensor) -> Observers:
-        """Agents ``index`` among ``objects``."""
+        """Return the agents ``index`` among ``objects`` as observers."""
         state, size = rows_of(objects.state, index), rows_of(objects.size, index)
         height = None if objects.height is None else rows_of(objects.height, index)
         heading = state[..., 2]
@@ -71,7 +71,7 @@ class Observers(NamedTuple):
 
 
 def frame(heading: Float[Tensor, "*b"]) -> Callable[..., tuple[Tensor, Tensor]]:
-    """What turns vectors x and y into the frame of agents with these headings, and may divide them by a scale."""
+    """Return a function that turns vectors x, y into the frame of agents with these headings and may scale them."""
     # Component by component: operations on a last dimension of 2 are slow.
     turn = -heading
     cos, sin = turn.cos(), turn.sin()
@@ -84,7 +84,7 @@ def frame(heading: Float[Tensor, "*b"]) -> Callable[..., tuple[Tensor, Tensor]]:
 
 
 def rows_of(values: Float[Tensor, "M A F"], index: Int[Tensor, "M K"]) -> Float[Tensor, "M K F"]:
-    """Each row's values at its own index."""
+    """Return each row's values at its own index."""
     return values.gather(1, index[..., None].expand(*index.shape, values.shape[-1]))
 
 
@@ -96,8 +96,8 @@ def objects_at(
     index: Int[Tensor, "M N"],
     index_valid: Bool[Tensor, "M N"],
 ) -> Objects:
-    """The agents of each row's scene at a logged step (past the end of the log nothing is valid): log playback, with
-    simulated agents in the rows ``index``, those that are real, put in their place.
+    """Return the agents of each row's scene at a logged step (past the end of the log none is valid): log playback,
+    in which simulated agents that are real replace the rows ``index``.
     """
     steps, agents = scenes.log_valid.shape[1:]
     row = scene * steps + step.clamp(max=steps - 1)
@@ -126,8 +126,8 @@ def everyone_at(
     state: Float[Tensor, "M N 4"],
     valid: Bool[Tensor, "M N"],
 ) -> Objects:
-    """Everyone at a step: interactive agents in their states where they are ``valid``, all others as logged. In open
-    traffic one that has left, or not entered yet, is not played back.
+    """Return all objects at a step: interactive agents in their states where they are ``valid``, all others as
+    logged. In open traffic one that has left, or not entered yet, is not played back.
     """
     index = scenes.interactive.index_select(0, scene)
     found = objects_at(scenes, scene, step, state, index, valid)
@@ -141,7 +141,7 @@ def everyone_at(
 def _height(
     scenes: SceneBatch, scene: Int[Tensor, " M"], position: Float[Tensor, "M N 2"], agent: Int[Tensor, "M N"]
 ) -> Float[Tensor, "M N 2"]:
-    """Height and level of agents where the log has them nearest to positions."""
+    """Return height and level of agents where the log has them nearest to positions."""
     row = scene[:, None]
     away = (scenes.log_state[row, :, agent, :2] - position[..., None, :]).square().sum(-1)
     step = away.masked_fill(~scenes.log_valid[row, :, agent], torch.inf).argmin(-1)
@@ -151,8 +151,8 @@ def _height(
 def rollout_heights(
     scenes: SceneBatch, state: Float[Tensor, "B K T N 4"], scene: Int[Tensor, " B"] | None = None
 ) -> Float[Tensor, "B K T N 2"] | None:
-    """Height and level of the interactive agents in states of rollouts, of all or some rows of the scenes; None where
-    no scene has levels.
+    """Return height and level of the interactive agents in states of rollouts, of all or some rows of the scenes;
+    None where no scene has levels.
     """
     if not scenes.agent_height.shape[1]:
         return None
@@ -171,8 +171,8 @@ def entering(
     ready: Bool[Tensor, "M N"],
     late: Bool[Tensor, "M N"] | None = None,
 ) -> Bool[Tensor, "M N"]:
-    """Which agents that are ready can enter, far enough from all others: farther where they come ``late``, past the
-    log, as nobody knows then that it went well.
+    """Return which of the ready agents can enter, far enough from all others: farther where they come ``late``, past
+    the log, where no log shows that it went well.
 
     Of several that are ready at once the earlier slot goes first: a later one is kept away from where it is, even if
     that one can't enter either. Those that are ready stand among ``objects`` where they enter; ``index`` are the rows
@@ -203,7 +203,7 @@ def entering(
 def observed_objects(
     tables: Tables, objects: Objects, who: Observers, routes: RouteWindow | None
 ) -> dict[str, Tensor]:
-    """What agents see of the nearest others, by the distance between centres: the entries that are asked for."""
+    """Return what agents see of the nearest others, by the distance between centres: the configured entries."""
     config, agents = tables.config, objects.valid.shape[1]
     chosen, mask = _nearest(objects, who, config.num_objects)
     # Places among all agents there are now, and among those of all scenes.
@@ -226,7 +226,7 @@ def observed_objects(
 
 @torch.no_grad()
 def _nearest(objects: Objects, who: Observers, count: int) -> tuple[Int[Tensor, "M N O"], Bool[Tensor, "M N O"]]:
-    """Places in the scene of the nearest others, and which of them exist."""
+    """Return places in the scene of the nearest others, and which of them exist."""
     x, y = (objects.state[:, None, :, k] - who.state[..., k, None] for k in (0, 1))
     return nearest(torch.where(objects.others(who.agent), x.square() + y.square(), torch.inf), count)
 
@@ -238,7 +238,7 @@ def _features(
     row: Int[Tensor, "M N O"],
     mask: Bool[Tensor, "M N O"],
 ) -> Float[Tensor, "M N O F"]:
-    """Features of objects in states, rows of the table of all agents."""
+    """Return features of objects in states, rows of the table of all agents."""
     config = tables.config
     static = tables.agents.index_select(0, row.flatten()).unflatten(0, row.shape)
     origin_x, origin_y, heading, own_x, own_y = who.state[..., None, :].unbind(-1)
@@ -256,7 +256,7 @@ def _features(
 
 
 def _gaps(foresight: tuple[float, ...], who: Observers, state: Tensor, size: Tensor) -> Float[Tensor, "M N O H"]:
-    """Gaps to boxes [M, N, O] now and at times ahead, were everyone to keep speed and course."""
+    """Return gaps to boxes [M, N, O] now and at times ahead, if all keep speed and course."""
     # Times come first, and components apart, so that operations run along everything else.
     times = constant((0.0, *foresight), state.dtype, state.device)[:, None, None, None]
     own = who.state[..., None, :]

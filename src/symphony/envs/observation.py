@@ -31,7 +31,7 @@ _DISTANCES = 1 << 16  # distances held at a time
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """How much an agent observes and how it is scaled to numbers near one.
+    """The extent of an agent's observation, and how it is scaled to numbers near one.
 
     What is not asked for is neither computed nor an entry of a step: simulation without observation costs a fraction.
     """
@@ -55,17 +55,17 @@ class ObservationConfig:
 
     @property
     def blind(self) -> bool:
-        """Whether nothing is asked for, a route aside."""
+        """Whether nothing is observed, except perhaps a route."""
         return not (self.num_objects or self.num_points or self.num_lights or self.own or self.clearance)
 
     @classmethod
     def nothing(cls) -> ObservationConfig:
-        """Of agents that look at nothing but their state."""
+        """Return the configuration of agents that observe only their own state."""
         return cls(num_objects=0, num_points=0, own=False)
 
 
 def observation_spec(config: ObservationConfig, agents: int, device: torch.device | None = None) -> Composite:
-    """Shapes of what each of N agents observes."""
+    """Return the shapes of what each of N agents observes."""
     others, ahead = config.num_objects, len(config.foresight)
     measures = others if config.clearance or config.gaps else 0
     widths: dict[str, tuple[int, ...]] = {
@@ -98,15 +98,15 @@ def observe(
     tables: Tables | None = None,
     routes: RouteWindow | None = None,
 ) -> dict[str, Tensor]:
-    """What the agents ``index`` among ``objects`` observe, by the last part of its key (see :mod:`symphony.keys`).
+    """Return what agents ``index`` among ``objects`` observe, by the last part of its key (see :mod:`symphony.keys`).
 
     Of itself an agent observes speed, length, width and whether the last logged step is reached (0 or 1); masked
-    entries are zero, and what was not asked for has none. Nearness is the distance between centres. Lanes share their
-    end points, so ties are common: on the CPU they go to the elements that come first, whatever the padding, and
-    elements are in the order of the scene.
+    entries are zero, and what was not asked for is left out. Nearness is the distance between centres. Lanes share
+    their end points, so ties are common: on the CPU they go to the elements that come first, whatever the padding,
+    and elements are in the order of the scene.
 
-    Whoever observes a batch of scenes more than once keeps its ``tables``. Without ``routes``, what agents see of
-    them, nothing of routes is observed.
+    To observe a batch of scenes more than once, keep its ``tables``. Without ``routes``, what agents see of them,
+    nothing of routes is observed.
     """
     if config.blind and not config.route:
         return {}
@@ -147,8 +147,8 @@ def observe_states(
     progress: Float[Tensor, "M N"] | None = None,
     tables: Tables | None = None,
 ) -> tuple[dict[str, Tensor], Objects]:
-    """What interactive agents observe in given states, where they are ``valid``, and everyone whom they could see. No
-    environment is needed.
+    """Return what interactive agents observe in given states, where they are ``valid``, and all objects that they
+    could see. No environment is needed.
 
     Goals are the routes that they follow, -1 for none, ``progress`` the metres that they have come along them;
     without these nothing of routes is observed. Other arguments are those of :func:`observe`.
@@ -162,13 +162,13 @@ def observe_states(
 
 
 def observed_points(tables: Tables, who: Observers) -> tuple[Float[Tensor, "M N K F"], Bool[Tensor, "M N K"]]:
-    """Features of the nearest points in each agent's frame, on its level, and which of them exist."""
+    """Return features of the nearest points in each agent's frame, on its level, and which of them exist."""
     flat, mask = nearest_points(tables, who.scene, who.state.detach()[..., :2], who.height)
     return _features(tables, who, flat, mask), mask
 
 
 def observed_lights(tables: Tables, who: Observers) -> tuple[Float[Tensor, "M N L F"], Bool[Tensor, "M N L"]]:
-    """Features of the nearest lights in each agent's frame, however far, on its level, and which of them exist."""
+    """Return features of the nearest lights in each agent's frame, however far, on its level, and which exist."""
     position, number = tables.light_points
     with torch.no_grad():
         squared = (position[who.scene][:, None] - who.state[..., None, :2]).square().sum(-1)
@@ -187,7 +187,7 @@ def nearest_points(
     origin: Float[Tensor, "M N 2"],
     height: Float[Tensor, "M N 2"] | None = None,
 ) -> tuple[Int[Tensor, "M N K"], Bool[Tensor, "M N K"]]:
-    """Numbers of the nearest points among all points of all scenes, and which of them exist.
+    """Return numbers of the nearest points among all points of all scenes, and which of them exist.
 
     With heights and levels, points on other levels do not (see :func:`symphony.geometry.levels_apart`).
     """
@@ -215,7 +215,7 @@ def nearest_points(
 def _among_all(
     tables: Tables, scene: Int[Tensor, " M"], origin: Float[Tensor, "M N 2"], height: Tensor | None
 ) -> tuple[Int[Tensor, "M N K"], Bool[Tensor, "M N K"]]:
-    """What :func:`nearest_points` gives, from the distances to all points of a scene."""
+    """Return the same as :func:`nearest_points`, from the distances to all points of a scene."""
     x, y = tables.position
     squared = (x[scene][:, None] - origin[..., :1]).square() + (y[scene][:, None] - origin[..., 1:]).square()
     if height is not None:
@@ -228,7 +228,7 @@ def _among_all(
 def _features(
     tables: Tables, who: Observers, flat: Int[Tensor, "M N K"], mask: Bool[Tensor, "M N K"]
 ) -> Float[Tensor, "M N K F"]:
-    """Features of the points ``flat`` as agents see them."""
+    """Return features of the points ``flat`` as agents see them."""
     config, index = tables.config, flat.flatten()
     # A copy of the rows, which nobody else has yet: what depends on the agent is written over it. That takes half of
     # the time of putting columns together.

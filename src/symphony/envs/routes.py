@@ -50,7 +50,7 @@ _CUT, _SLACK = 1.5, 3.0
 
 @dataclass(frozen=True)
 class RouteTable:
-    """Feasible routes of one vehicle from where it begins."""
+    """The feasible routes of one vehicle from its first position."""
 
     points: NDArray[np.float32]  # [P, 2] of all, SPACING apart from beside the vehicle on
     count: NDArray[np.int64]  # [G] points of each
@@ -58,7 +58,7 @@ class RouteTable:
     logged: int  # one of these, drawn from segment and agent alone; -1 where the vehicle is on no lane
 
     def line(self, route: int) -> NDArray[np.float32]:
-        """Points [K, 2] of one route."""
+        """Return points [K, 2] of one route."""
         begin = int(self.count[:route].sum())
         return self.points[begin : begin + int(self.count[route])]
 
@@ -67,20 +67,20 @@ NO_ROUTES = RouteTable(np.zeros((0, 2), np.float32), np.zeros(0, np.int64), np.z
 
 
 def drivable(segment: RunSegment, steps: int) -> float:
-    """Metres that the fastest agent of a segment can drive in so many steps, or a little more."""
+    """Return the metres that the fastest agent of a segment can drive in ``steps`` steps, or a little more."""
     speed = np.linalg.norm(segment.velocity[segment.valid], axis=-1).max(initial=0.0)
     return min(_FASTER * float(speed), _FASTEST) * (steps - 1) * segment.dt
 
 
 def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 0) -> RouteTable:
-    """Routes that an agent of a segment can take, and which of them it took (paper, section IV-B).
+    """Return the routes that an agent of a segment can take, and which of them it took (paper, section IV-B).
 
     They follow every branch for :data:`symphony.roadgraph.routes.HORIZON` metres, or as far as agents can drive in
     the log, and reach :data:`ONWARD` metres beyond what can be driven in the segment, unless the map ends. Where they
     can't be built, a :class:`~symphony.errors.DataWarning` says so, and there are none.
 
-    Routes begin with the agent's first valid state from step ``begin``, at which it comes in, on; of one that comes
-    in later with the first on a lane.
+    Routes begin with the agent's first valid state from step ``begin``, at which it enters, on; those of an agent
+    that enters later with its first state on a lane.
     """
     steps, starts, first = begin + np.flatnonzero(segment.valid[agent, begin:]), [], 0
     for first in steps.tolist() if begin else steps[:1].tolist():
@@ -108,7 +108,7 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
 
 
 def _starts(segment: RunSegment, graph: LaneGraph, agent: int, step: int) -> list[tuple[int, float]]:
-    """Lanes that an agent may be on, and metres along them: those of its height, where the map has any."""
+    """Return lanes that an agent may be on, and metres along them: those of its height, where the map has any."""
     position, lanes = segment.position[agent, step], segment.road.lanes
     starts = starting_lanes(graph, position[:2], float(segment.heading[agent, step]))
     if len(starts) < 2 or np.ptp(lanes.points[:, 2]) < LEVEL:
@@ -122,8 +122,8 @@ def _starts(segment: RunSegment, graph: LaneGraph, agent: int, step: int) -> lis
 
 
 def packed(tables: Sequence[RouteTable], least: int = 0) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Points [R, 2] of all routes of N agents, the place among them of each route's first [N, G], and how many it
-    has [N, G], 0 for padding; G is at least ``least``.
+    """Return points [R, 2] of all routes of N agents, the place among them of each route's first [N, G], and how many
+    it has [N, G], 0 for padding; G is at least ``least``.
     """
     most = max([least, *(len(table.count) for table in tables)])
     count = np.zeros((len(tables), most), np.int64)
@@ -136,7 +136,7 @@ def packed(tables: Sequence[RouteTable], least: int = 0) -> tuple[NDArray[Any], 
 def logged_progress(
     tables: Sequence[RouteTable], position: Float[NDArray[np.floating], "N T 2"], valid: Bool[NDArray, "N T"]
 ) -> Float[NDArray[np.float32], "N T"]:
-    """Metres that agents have come along the routes that they took, at each step; 0 where that is not known."""
+    """Return the metres that agents have come along the routes that they took, at each step; 0 if unknown."""
     found = np.zeros(valid.shape, np.float32)
     rows = [row for row, table in enumerate(tables) if table.logged >= 0]
     if rows:
@@ -156,7 +156,7 @@ class Routes(NamedTuple):
     length: Tensor  # [B, N, G] int64 points of each; 0 for padding
 
     def of(self, scene: Int[Tensor, " M"], goal: Int[Tensor, "M N"]) -> FollowedRoutes:
-        """The routes that agents follow: none where there is no route of that number."""
+        """Return the routes that agents follow: none where there is no route of that number."""
         _, agents, number = self.length.shape
         if number == 0:
             none = torch.zeros_like(goal)
@@ -172,12 +172,12 @@ class Routes(NamedTuple):
         return FollowedRoutes(self.point.flatten(0, 1), begin, torch.where(exists, count, 0))
 
     def among(self, scene: Int[Tensor, " M"]) -> FollowedRoutes:
-        """All routes [M, N, G] that the agents of scenes can choose from."""
+        """Return all routes [M, N, G] that the agents of scenes can choose from."""
         begin = self.first[scene] + (scene * self.point.shape[1])[:, None, None]
         return FollowedRoutes(self.point.flatten(0, 1), begin, self.length[scene])
 
     def beginnings(self) -> tuple[Float[Tensor, "B N G K 2"], Int[Tensor, "B N G"]]:
-        """The first :data:`POINTS` points of all routes, by which one is chosen, and how many of them exist."""
+        """Return the first :data:`POINTS` points of all routes, by which one is chosen, and which are real."""
         every = self.among(torch.arange(len(self.point), device=self.first.device))
         return every.points(POINTS), self.length.clamp_max(POINTS)
 
@@ -190,7 +190,7 @@ class FollowedRoutes(NamedTuple):
     length: Tensor  # [*b] int64 points of each; 0 for none
 
     def points(self, place: Int[Tensor, "*b K"] | int) -> Float[Tensor, "*b K 2"]:
-        """Points at places of each route, or so many first ones; past the end the last one again, zeros for none."""
+        """Return points at places of each route, or the first ones; past its end the last one, zeros for none."""
         if isinstance(place, int):
             place = torch.arange(place, device=self.begin.device).expand(*self.begin.shape, place)
         if not len(self.point):
@@ -200,11 +200,11 @@ class FollowedRoutes(NamedTuple):
         return found.unflatten(0, place.shape) * (self.length > 0)[..., None, None]
 
     def lines(self) -> tuple[Float[Tensor, "*b K 2"], Int[Tensor, "*b"]]:
-        """All points of the routes, those past the end as the last one, and their number. On a device this waits."""
+        """Return all points of the routes, padded with the last one, and their number. On a device this waits."""
         return self.points(max(2, int(self.length.max())) if self.length.numel() else 2), self.length
 
     def window(self, progress: Float[Tensor, "M N"]) -> RouteWindow:
-        """What is seen of the routes by agents that have come so many metres along them."""
+        """Return what agents see of their routes, given the metres that they have come along them."""
         own = (progress / SPACING).round().long().minimum((self.length - 2).clamp_min(0))
         start = (own - BEHIND).clamp_min(0)
         place = start[..., None] + torch.arange(WINDOW, device=start.device)
@@ -213,8 +213,8 @@ class FollowedRoutes(NamedTuple):
     def progress(
         self, position: Float[Tensor, "M N 2"], about: Float[Tensor, "M N"], moved: Float[Tensor, "M N"]
     ) -> Float[Tensor, "M N"]:
-        """Metres along the routes of the places nearest to agents, looked for around where they were before
-        (``about``, in metres along), as they have ``moved`` so many metres since.
+        """Return metres along the routes of the places nearest to agents, sought around where they were before
+        (``about``, in metres along), given the metres that they have ``moved`` since.
         """
         reach, about = _CUT * moved[..., None] + _SLACK, about[..., None]
         start = ((about / SPACING).long() - _BACK).clamp_min(0)
@@ -235,7 +235,7 @@ class FollowedRoutes(NamedTuple):
 
 
 class RouteWindow(NamedTuple):
-    """What agents see of their routes."""
+    """The part of their routes that agents see."""
 
     points: Tensor  # [M, N, W, 2] points, SPACING apart
     exists: Tensor  # [M, N, W] which of them are there
@@ -243,7 +243,7 @@ class RouteWindow(NamedTuple):
 
 
 def route_ahead(state: Float[Tensor, "M N 4"], routes: RouteWindow, distance_scale: float) -> Float[Tensor, "M N F"]:
-    """What each agent observes of its route, in its own frame.
+    """Return what each agent observes of its route, in its own frame.
 
     Whether it has one, how far to the left the route lies (metres / 5), its direction, then position and existence of
     points ahead. All zero without a route. ``distance_scale`` are the metres that become 1.
@@ -270,9 +270,9 @@ def along_route(
     size: Float[Tensor, "M N O 2"],
     routes: RouteWindow,
 ) -> Float[Tensor, "M N O F"]:
-    """Where others are along each agent's route (Frenet coordinates), as bounded numbers.
+    """Return where others are along each agent's route (Frenet coordinates), as bounded numbers.
 
-    Whether it can be said; the gap along the route between the boxes (three scales, positive ahead, 0 while they are
+    Whether this is known; the gap along the route between the boxes (three scales, positive ahead, 0 while they are
     side by side); how far to the left of the route (two scales) and how far beside the agent's own width; how much
     faster along the route (two scales); the share d / (d + 2) of the deceleration d in m/s^2 that keeps the agent
     behind what it closes in on; whether it is ahead. All zero beyond what is seen of the route, more than
@@ -319,7 +319,7 @@ def along_route(
 def route_choices(
     state: Float[Tensor, "M N 4"], routes: FollowedRoutes, distance_scale: float, *, turns: bool = False
 ) -> tuple[Float[Tensor, "M N G F"], Bool[Tensor, "M N G"]]:
-    """Every feasible route as features in the agent's frame, and which of them exist.
+    """Return every feasible route as features in the agent's frame, and which of them exist.
 
     A feature vector is position, direction and existence of every :data:`STRIDE`-th of the first :data:`POINTS`
     points; ``distance_scale`` are the metres that become 1. With ``turns`` also where the route begins, resolved to
@@ -340,7 +340,7 @@ def route_choices(
 def _shape_of_routes(
     state: Float[Tensor, "*b 4"], routes: FollowedRoutes, distance_scale: float, turns: bool
 ) -> Float[Tensor, "*b F"]:
-    """Features of routes, each in the frame of its agent."""
+    """Return features of routes, each in the frame of its agent."""
     points, count = routes.points(POINTS), routes.length.clamp_max(POINTS)[..., None]
     kept, angle = points[..., ::STRIDE, :], -state[..., None, 2]
     local = rotate(kept - state[..., None, :2], angle)

@@ -1,4 +1,4 @@
-"""From run segments to the padded tensors a simulation reads: the static part, stored once per segment.
+"""The padded tensors that a simulation reads of run segments: the static part, stored once per segment.
 
 Shapes: B scenes, A agents, N interactive agents, T logged steps, P map and light points, Q lights, E boundary
 segments. World frame of the segment, SI units.
@@ -41,7 +41,7 @@ BESIDE = 2.5  # metres to either side of the end of a lane within which an agent
 
 
 class PointType(IntEnum):
-    """What a point of the observation stands for."""
+    """The kind of a point in the observation."""
 
     LANE = 0
     BIKE_LANE = 1
@@ -61,7 +61,7 @@ _MARKS = {
 
 
 class MapEdge(NamedTuple):
-    """Where a map ends."""
+    """The place where a map ends."""
 
     exits: NDArray[np.float32]  # [X, 4] ends of lanes that go nowhere: x, y and the direction of travel
     # [H, 3] outward normal and offset of the sides of the convex hull of all lanes, MARGIN added: a point p is
@@ -70,7 +70,7 @@ class MapEdge(NamedTuple):
 
 
 def map_edge(graph: LaneGraph) -> MapEdge:
-    """Where the map of a lane graph ends.
+    """Return where the map of a lane graph ends.
 
     A lane goes nowhere if neither it nor a lane beside it has a successor: one that ends beside others, as on a ramp,
     is left by a lane change.
@@ -91,13 +91,13 @@ def map_edge(graph: LaneGraph) -> MapEdge:
 
 
 def beyond(position: NDArray[np.floating], edge: MapEdge) -> NDArray[np.bool_]:
-    """Whether positions [..., 2] lie outside of the hull."""
+    """Return whether positions [..., 2] lie outside of the hull."""
     return np.asarray((position @ edge.hull[:, :2].T > edge.hull[:, 2]).any(-1))
 
 
 def leaving(before: Tensor, after: Tensor, exits: Tensor, hull: Tensor) -> Bool[Tensor, "M N"]:
-    """Whether a step of agents [M, N, 2] led out of the map: over the end of an exit [M, X, 4], or out of the hull
-    [M, H, 3]. Padding is all zeros.
+    """Return whether a step of agents [M, N, 2] led out of the map: over the end of an exit [M, X, 4], or out of the
+    hull [M, H, 3]. Padding is all zeros.
     """
     end, ahead = exits[:, None, :, :2], exits[:, None, :, 2:]
     start, stop = before[:, :, None] - end, after[:, :, None] - end
@@ -111,7 +111,7 @@ def leaving(before: Tensor, after: Tensor, exits: Tensor, hull: Tensor) -> Bool[
 
 
 class SceneSource(Protocol):
-    """Where an environment draws its scenes from, such as a store that is larger than memory."""
+    """A source from which an environment draws its scenes, such as a store that is larger than memory."""
 
     interactive: int  # N, interactive agents per scene
 
@@ -126,11 +126,11 @@ class SceneSource(Protocol):
         ...
 
     def draw(self, count: int, rng: torch.Generator) -> list[int]:
-        """Numbers of different run segments at random (all, if there are fewer)."""
+        """Return numbers of different run segments at random (all, if there are fewer)."""
         ...
 
     def scenes(self, items: Sequence[int]) -> SceneBatch:
-        """The run segments of these numbers as one batch, which names them in ``segment``."""
+        """Return the run segments of these numbers as one batch, which names them in ``segment``."""
         ...
 
 
@@ -180,7 +180,7 @@ class SceneBatch(TensorClass):
 
     @property
     def open_traffic(self) -> bool:
-        """Whether agents enter and leave: where the scenes say where their maps end."""
+        """Whether agents enter and leave, as they do where the scenes say where their maps end."""
         return self.exits.shape[1] + self.hull.shape[1] > 0
 
     @property
@@ -189,7 +189,7 @@ class SceneBatch(TensorClass):
         return Routes(self.route_point, self.route_first, self.route_count)
 
     def whole_route(self, scene: int, agent: int, route: int) -> Tensor:
-        """Points [K, 2] of one route of an interactive agent."""
+        """Return points [K, 2] of one route of an interactive agent."""
         begin = int(self.route_first[scene, agent, route])
         return self.route_point[scene, begin : begin + int(self.route_count[scene, agent, route])]
 
@@ -203,9 +203,9 @@ def scene(
     edge: MapEdge | None = None,
     background: Sequence[bool] | NDArray[np.bool_] | None = None,
 ) -> SceneBatch:
-    """One run segment as a batch of one scene, without padding.
+    """Return one run segment as a batch of one scene, without padding.
 
-    Interactive are so many agents, chosen by the paper's rule, or those of some rows, of which a rule drives the
+    Interactive agents are as many as given, by the paper's rule, or those of given rows, of which a rule drives the
     ``background`` [N]. With the lanes' graph the scene holds their routes; with the edge of the map the traffic is
     open: they enter where the log first has them within the map, and leave at its edge. ``number`` is the segment's
     among those that scenes are drawn from. Raises a :class:`DataError` if the segment has fewer usable agents.
@@ -255,13 +255,13 @@ def scene(
 
 
 def few(size: int) -> int:
-    """The next of few sizes: multiples of 8, from 32 on four in every doubling; coordinates stay as they are."""
+    """Return the next of few sizes: multiples of 8, from 32 on four in every doubling; coordinates are kept."""
     step = 1 << max(3, (size - 1).bit_length() - 3)
     return size if size <= COORDINATES else -(-size // step) * step
 
 
 def collate(scenes: Sequence[SceneBatch], agents: int = 0, shapes: dict[str, list[int]] | None = None) -> SceneBatch:
-    """Stack scenes into one batch, padded to the largest of each size, and to so many interactive agents.
+    """Stack scenes into one batch, padded to the largest of each size, and to ``agents`` interactive agents.
 
     Padded steps repeat nothing: they are masked by ``log_valid`` and lie past ``last_step``. ``shapes`` of batches so
     far, by field, let this one be no smaller, and its sizes :func:`few`, for programs that are compiled for shapes:
@@ -304,7 +304,7 @@ def collate(scenes: Sequence[SceneBatch], agents: int = 0, shapes: dict[str, lis
 
 
 def with_few_steps(scenes: SceneBatch) -> SceneBatch:
-    """Scenes with a number of logged steps out of :func:`few`, the last ones padding."""
+    """Return scenes with a number of logged steps out of :func:`few`, the last ones padding."""
     found, more = scenes.clone(recurse=False), few(scenes.log_valid.shape[1]) - scenes.log_valid.shape[1]
     for name in _TIMED_FIELDS:
         value = getattr(scenes, name)
@@ -320,7 +320,7 @@ _AGENT_FIELDS += ["route_first", "route_count", "route_logged"]
 
 
 def _edges(boundary: Polylines, levels: Levels) -> dict[str, NDArray[Any]]:
-    """The simplified boundary as segments, with the heights of their middles where there are levels."""
+    """Return the simplified boundary as segments, with the heights of their middles where there are levels."""
     numbers = boundary.points[:, : 2 if levels.flat else 3].astype(np.float64)
     lines = shapely.simplify(shapely.linestrings(numbers, indices=boundary.line_index), BOUNDARY_TOLERANCE)
     found, line = shapely.get_coordinates(lines, include_z=not levels.flat, return_index=True)
@@ -339,13 +339,13 @@ def _edges(boundary: Polylines, levels: Levels) -> dict[str, NDArray[Any]]:
 
 
 def _no_heights(part: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Heights of a scene without levels, beside others that have some."""
+    """Return empty heights for a scene without levels, to stand beside others that have some."""
     sizes = {"agent": "log_valid", "point": "point_valid", "edge": "edge_valid"}
     return {f"{name}_height": torch.zeros(*part[like].shape, 2) for name, like in sizes.items()}
 
 
 def _points(segment: RunSegment, levels: Levels) -> dict[str, NDArray[Any]]:
-    """Lanes, boundary and marks as evenly spaced points, then one point per light."""
+    """Return lanes, boundary and marks as evenly spaced points, then one point per light."""
     road = segment.road
     bike = np.where(road.lane_type == LaneType.BIKE_LANE, PointType.BIKE_LANE, PointType.LANE)
     marks = np.array([_MARKS.get(MarkType(kind), PointType.OTHER) for kind in road.mark_type], np.int64)
@@ -376,8 +376,8 @@ def _points(segment: RunSegment, levels: Levels) -> dict[str, NDArray[Any]]:
 
 
 def _resampled(lines: Polylines) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
-    """Points [P, 3] at most :data:`SPACING` apart along each line (ends included), unit directions [P, 2] and the
-    line each belongs to [P]. A line without length is one point with direction 0.
+    """Return points [P, 3] at most :data:`SPACING` apart along each line (ends included), unit directions [P, 2] and
+    the line each belongs to [P]. A line without length is one point with direction 0.
     """
     xy = lines.points.astype(np.float64)
     owner = lines.line_index

@@ -1,8 +1,8 @@
-"""Collisions of single rollouts: with whom, when, how and whose fault; and how long until the next one.
+"""Collisions of single rollouts: with whom, when, how and at whose fault; and how long until the next one.
 
 Contacts are found between the states; of each pair the first counts. Fault is judged at the time of contact, in the
 sense of nuPlan's at-fault collisions (https://github.com/motional/nuplan-devkit): an agent answers for what it drives
-into, not for being driven into. To these rules come red lights, lanes that an agent leaves, and lane changes in front
+into, not for being driven into. Further rules are red lights, lanes that an agent leaves, and lane changes in front
 of others that are too close by RSS (Shalev-Shwartz et al., "On a formal model of safe and scalable self-driving
 cars", 2017, definition 1). ``docs/metrics.md`` has them in a table.
 
@@ -58,7 +58,7 @@ class Contacts(NamedTuple):
 def contacts(worlds: Sequence[World], evaluated: Indices) -> list[Contacts]:
     """Return the collisions of evaluated agents [M] in each of some rollouts of one segment.
 
-    The first states do not count, and nobody meets others on another level.
+    The first states do not count, and agents on different levels never meet.
     """
 
     def stacked(name: str) -> torch.Tensor:
@@ -74,7 +74,7 @@ def contacts(worlds: Sequence[World], evaluated: Indices) -> list[Contacts]:
 
 
 def _first(world: World, agent: Indices, other: Indices, step: Indices, share: Reals) -> Contacts:
-    """Of the contacts of each pair the first, in order of time."""
+    """Return of the contacts of each pair the first, in order of time."""
     boxes = [
         from_numpy(part)
         for row in (agent, other)
@@ -103,9 +103,9 @@ def pose_ends(world: World, row: Indices, other: Indices, step: Indices) -> tupl
 
 
 def time_to_collision(world: World, evaluated: Indices) -> Reals:
-    """Return the seconds [M, U] until an evaluated agent would first overlap one ahead of it, if both go on so.
+    """Return the seconds [M, U] until an evaluated agent first overlaps one ahead of it, if both go on unchanged.
 
-    Everyone keeps velocity and heading, and nobody meets others on another level. Infinite if that is more than
+    All agents keep velocity and heading, and those on different levels never meet. Infinite if that is more than
     :data:`HORIZON` away, or the agent has stopped or is not there.
     """
     found = np.full((len(evaluated), world.valid.shape[1]), math.inf)
@@ -196,8 +196,8 @@ def _party(world: World, row: Indices, other: Indices, found: Contacts) -> _Part
 
 
 def _face(me: _Party, it: _Party) -> Indices:
-    """With which side each agent touches [E]: that whose normal parts the boxes last, or of a corner that meets the
-    other's side, the end it is at. Who is only beside the last :data:`CORNER` before the front touches that.
+    """Return the side [E] with which each agent touches: that whose normal parts the boxes last, or of a corner that
+    meets the other's side, its end. One that is beside only the last :data:`CORNER` before the front touches with it.
     """
     away = from_numpy(it.position - me.position)
     pair = relation(away[:, 0], away[:, 1], from_numpy(me.heading), from_numpy(it.heading))
@@ -222,8 +222,8 @@ def _ran_red(row: Indices, step: Indices, lights: Lights, dt: float) -> Bools:
 
 
 def _reaching(me: _Party, it: _Party, lanes: Lanes) -> Bools:
-    """Whether an agent is in no lane, reaches over that edge of its lane which is towards the other, or over the far
-    one on its way in [E].
+    """Return whether an agent is in no lane, reaches over the edge of its lane towards the other, or over the far
+    edge on its way in [E].
     """
     graph, lane = lanes.graph, lanes.lane_of(me.position, me.heading, me.height)
     found = np.ones(len(lane), bool)
@@ -245,8 +245,8 @@ def _reaching(me: _Party, it: _Party, lanes: Lanes) -> Bools:
 
 
 def _cut_in(world: World, rear: Indices, front: Indices, step: Indices, dt: float) -> Bools:
-    """Whether the one ahead came into the path of the one behind shortly before their contact, nearer than is safe
-    [E]. The path is the one driven, so that a bend or a lane change of the one behind makes nobody cut in.
+    """Return whether the one ahead came into the path of the one behind shortly before their contact, nearer than is
+    safe [E]. The path is the one driven, so that nobody cuts in because the one behind turns or changes lanes.
     """
     times = np.maximum(step[:, None] + np.arange(-math.ceil(CUT_IN_SECONDS / dt) - 1, 0), 0)
     ours, theirs = world.position[rear[:, None], times], world.position[front[:, None], times]

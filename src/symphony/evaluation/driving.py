@@ -191,7 +191,7 @@ def _long(flags: Bools, dt: float) -> Bools:
 
 
 def _seen_from(world: World, row: Indices, step: Indices, points: Reals) -> tuple[Reals, Reals]:
-    """How far points [E, K, 2] are ahead of agents' fronts, and to their left [E, K]."""
+    """Return how far points [E, K, 2] are ahead of agents' fronts, and to their left [E, K]."""
     heading = world.heading[row, step][:, None]
     x, y = np.moveaxis(points - world.position[row, step][:, None], -1, 0)
     cos, sin = np.cos(heading), np.sin(heading)
@@ -199,7 +199,7 @@ def _seen_from(world: World, row: Indices, step: Indices, points: Reals) -> tupl
 
 
 def _goes_on(lanes: Lanes, position: Reals, heading: Reals, height: Heights) -> Bools:
-    """Whether agents [E] are in lanes that go on for a while."""
+    """Return whether agents [E] are in lanes that go on for a while."""
     graph, lane = lanes.graph, lanes.lane_of(position, heading, height)
     found, inside = lane >= 0, np.flatnonzero(lane >= 0)
     lines = graph.index.geometry[np.searchsorted(graph.usable_lanes, lane[inside])]
@@ -238,7 +238,7 @@ def _green(world: World, row: Indices, step: Indices, lanes: Lanes, start: int, 
 
 
 def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> tuple[Reals, Reals, Reals]:
-    """Return the metres [K, M] that evaluated agents got on: in all, while the log has them, and what the log got on.
+    """Return the progress [K, M] in metres of evaluated agents: in all, while the log has them, and that of the log.
 
     They are measured along the route that an agent follows, and beyond its end along the path of the log, where the
     log goes on from there. A route that passes a place twice is followed in order
@@ -283,7 +283,7 @@ def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> tuple[Re
 
 
 def _with_log(route: Reals, log: Reals, seen: Bools) -> Reals:
-    """A route [P, 2], and from its end on the path of a log [U, 2] that goes on from there."""
+    """Return a route [P, 2], and from its end on the path of a log [U, 2] that goes on from there."""
     places = stations_along(route[None], log[None], seen[None])[0]
     length = np.linalg.norm(np.diff(route, axis=0), axis=-1).sum()
     passed = np.flatnonzero(seen & (places >= length - 1e-3))
@@ -300,7 +300,7 @@ def _length(path: Reals, valid: Bools) -> Reals:
 
 
 def _advance(places: Reals, counted: Bools) -> Reals:
-    """Metres [R] from the first to the last counted one of places along lines [R, U]."""
+    """Return metres [R] from the first to the last counted one of places along lines [R, U]."""
     row, last = np.arange(len(places)), counted.shape[1] - 1 - counted[:, ::-1].argmax(1)
     return np.where(counted.any(1), places[row, last] - places[row, counted.argmax(1)], 0.0)
 

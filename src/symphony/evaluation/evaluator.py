@@ -42,7 +42,7 @@ Observer = Callable[[int, SavedRollouts], None]
 
 @dataclass
 class Evaluation:
-    """What the evaluator found of an agent."""
+    """The result of evaluating an agent."""
 
     agent: str
     metrics: RolloutMetrics
@@ -150,7 +150,7 @@ class _BatchEvaluator:
     seen: bool  # whether rollouts are asked for, too
 
     def __call__(self, items: list[int]) -> tuple[list[int], list[Evaluation], list[SavedRollouts]]:
-        """The items, what was found of each agent, and the rollouts of the first where they are asked for."""
+        """Return the items, the evaluation of each agent, and the rollouts of the first if they are asked for."""
         with naming(self.dataset, items):
             scenes = self.dataset.scenes(items).to(torch.device(self.blank[0].config.device))
             if bool((scenes.last_step > scenes.log_end).any()):
@@ -234,7 +234,7 @@ class _BatchEvaluator:
     def _curvatures(
         self, items: list[int], state: Float[Tensor, "B *k U N 4"], there: Bool[Tensor, "B *k U N"]
     ) -> list[NDArray[np.float64]]:
-        """Of every segment the average curvature of every branching region that each trajectory visits."""
+        """Return for each segment the average curvature of every branching region that each trajectory visits."""
         path, there = state.transpose(-2, -3).cpu().numpy(), there.transpose(-1, -2).cpu()
         return [
             visited_curvatures(self.dataset.graph(item), path[b, ..., :2], path[b, ..., 2], there[b].numpy())
@@ -243,7 +243,7 @@ class _BatchEvaluator:
 
 
 def _choices(scenes: SceneBatch, found: Simulation) -> list[Choice] | None:
-    """What a search made of the goals; None without search or without goals."""
+    """Return how a search changed the choice of goals; None without search or without goals."""
     if found.search is None or found.drawn is None or not scenes.route_point.shape[1]:
         return None
     # The rollouts of a tree are the first of its leaves.
@@ -258,7 +258,7 @@ def _choices(scenes: SceneBatch, found: Simulation) -> list[Choice] | None:
 
 
 def _heights(scenes: SceneBatch, rollouts: Rollouts, *, as_logged: bool) -> tuple[Tensor, Tensor] | None:
-    """Height and level of the interactive agents [B, K, N, T+1, 2] and of all as logged [B, 1, A, T+1, 2]."""
+    """Return height and level of interactive agents [B, K, N, T+1, 2] and of all as logged [B, 1, A, T+1, 2]."""
     own, driven = logged_heights(scenes), rollout_heights(scenes, rollouts.state)
     if own is None or driven is None:
         return None

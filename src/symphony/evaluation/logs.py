@@ -1,4 +1,4 @@
-"""What the logged driving in a store is like: is it physical, varied, and within reach of the action space?"""
+"""The quality of the logged driving in a store: is it physical, varied, and within reach of the action space?"""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def measure(
     and ``fit_error`` (metres between log and its fit to the action space, at the end) as percentiles and so on. NaN
     for what no segment has.
 
-    Raises a :class:`DataError` where no segment has so many interactive agents.
+    Raises a :class:`DataError` where no segment has enough interactive agents.
     """
     sums = defaultdict[str, list[Any]](list)
 
@@ -80,7 +80,7 @@ def measure(
 
 
 def _found(segment: RunSegment, rows: NDArray[np.int64], graph: LaneGraph) -> dict[str, Any]:
-    """Everything but the fit of one segment."""
+    """Return everything but the fit of one segment."""
     valid, both = segment.valid[rows], segment.valid[rows, 1:] & segment.valid[rows, :-1]
     position = segment.position[rows, :, :2].astype(np.float64)
     heading, velocity = segment.heading[rows].astype(np.float64), segment.velocity[rows].astype(np.float64)
@@ -115,7 +115,7 @@ def _percent(flags: NDArray[np.bool_]) -> float:
 
 
 def _spread(values: NDArray[Any]) -> dict[str, float]:
-    """Mean, standard deviation, percentiles and largest; NaN of nothing."""
+    """Return mean, standard deviation, percentiles and largest; NaN if there are no values."""
     known = values if len(values) else np.array([math.nan])
     found = {f"p{q}": v for q, v in zip(PERCENTILES, np.percentile(known, PERCENTILES), strict=True)}
     whole = {"mean": known.mean(), "std": known.std(), **found, "max": known.max()}

@@ -77,7 +77,7 @@ def planner_record(folder: RolloutFolder) -> Record:
 
 
 def crowd_name(record: Record) -> str:
-    """Return the crowd in few words: its agent, how many were driven, how they were searched, who drove the rest."""
+    """Return a short name of the crowd: its agent, how many were driven and searched how, who drove the rest."""
     name = str(record["crowd"]).rpartition("/")[2].removeprefix("pretrained:")
     settings = record["settings"]
     others = settings.get("others", "log")
@@ -119,8 +119,8 @@ def _crowds(records: Sequence[Record]) -> dict[str, list[Record]]:
 
 
 def check_crowds(records: Sequence[Record]) -> None:
-    """Refuse to put planners beside each other that did not meet the same, with a :class:`ConfigError` that names
-    what differs between two records of one crowd: the store, the settings or all segments.
+    """Refuse to compare planners that did not meet the same traffic, with a :class:`ConfigError` that names what
+    differs between two records of one crowd: the store, the settings or all segments.
     """
     first: dict[str, Record] = {}
     for one in records:
@@ -140,7 +140,7 @@ def check_crowds(records: Sequence[Record]) -> None:
 
 
 def _scores(record: Record) -> dict[str, float | None]:
-    """The mean score of each segment, None where no run has one."""
+    """Return the mean score of each segment, None where no run has one."""
     scores: dict[str, list[float]] = {run["segment"]: [] for run in record["per_run"]}
     for run in record["per_run"]:
         if (score := run_score(run)) is not None:
@@ -152,8 +152,8 @@ def winners(records: Sequence[Record]) -> list[str]:
     """Say for each crowd which planner scores best, and by how much over the next one.
 
     The difference is paired over the runs of the segments that both drove (± standard error over groups); whether 0
-    is outside of its 95 % interval is by Student's t. Of two that drove different segments the better is who was
-    better where both did.
+    is outside of its 95 % interval is by Student's t. Of two that drove different segments, the better is the one
+    that did better where both drove.
     """
     found = []
     for crowd, members in _crowds(records).items():

@@ -1,5 +1,5 @@
 """Evaluations of runs on disk: each run keeps its own, as ``RUN/evaluations/<name>.json``; the name says how the run
-was evaluated, so that the same evaluation made again takes the place of the earlier one.
+was evaluated, so that an evaluation that is repeated replaces the earlier one.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def _run_facts(name: str) -> dict[str, Any] | None:
 
 
 def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
-    """The settings of an evaluation, with what the agent decided and without what its search does not use."""
+    """Return the settings of an evaluation, with what the agent decided and without what its search does not use."""
     config, search, used = result.config, result.search, agent.plan(result.config).search
     tree = search == "tree"
     filled = dataclasses.asdict(config) | {
@@ -118,7 +118,7 @@ def evaluation_name(record: dict[str, Any]) -> str:
 
 
 def simulation_way(config: Mapping[str, Any]) -> str:
-    """Return how rollouts came about: ``none``, ``tree-1x16-replace-every2-goals=branch``."""
+    """Return how rollouts were made: ``none``, ``tree-1x16-replace-every2-goals=branch``."""
     return "-".join([*_search_words(config), *_unusual_words(config)])
 
 

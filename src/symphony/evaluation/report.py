@@ -1,6 +1,6 @@
-"""What happened in saved rollouts: a row for each run, totals with errors over groups of segments.
+"""The events in saved rollouts: a row for each run, totals with errors over groups of segments.
 
-A run is one rollout of one segment. What each number means: ``docs/metrics.md``.
+A run is one rollout of one segment. ``docs/metrics.md`` says what each number means.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _MEANS: dict[str, tuple[str, float, str | None]] = {
 
 @dataclass
 class Report:
-    """What was found in a folder of rollouts."""
+    """The findings in a folder of rollouts."""
 
     agent: str
     evaluated: Evaluated  # which driven agents: all interactive ones, or the ego
@@ -75,7 +75,7 @@ class Report:
         return Replay(saved, self.events.get(name, ()), self.collision_in.get(name))
 
     def past_log(self) -> Row:
-        """Return what happened past the end of the log beside what did in it (``log``); empty if all is logged."""
+        """Return what happened past the end of the log, and within it (``log``); empty if all is logged."""
         if not self.parts[1]["seconds"]:
             return {}
         found = {}
@@ -215,7 +215,7 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
 def _events(
     k: int, hits: Contacts, fault: Array, lights: driving.Lights, rows: Array, flags: Mapping[str, Array]
 ) -> list[Event]:
-    """What is to be marked in the replay of a rollout, by time."""
+    """Return the events to mark in the replay of a rollout, by time."""
     found = [
         Event(k, step, agent, "collision", KIND_NAMES[CollisionKind(kind)], other, mine, "collision")
         for agent, other, step, kind, mine in _each(hits.agent, hits.other, hits.step, hits.kind, fault)

@@ -46,7 +46,7 @@ class Entry:
 
     @property
     def way(self) -> str:
-        """How the run was simulated."""
+        """The way in which the run was simulated."""
         return records.simulation_way(self.record["config"])
 
     @property
@@ -226,7 +226,7 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
 
 
 def _cell(values: Sequence[float]) -> dict[str, Any]:
-    """The mean of some seeds, NaN where one of them is, and its standard error, NaN for a single seed."""
+    """Return the mean of some seeds, NaN where one of them is, and its standard error, NaN for a single seed."""
     error = float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
     return {"mean": float(np.mean(values)), "se": error, "values": list(values)}
 
@@ -242,7 +242,7 @@ def _mark_best(rows: Sequence[dict[str, Any]]) -> None:
 
 
 def _wosac_year(entries: Sequence[Entry]) -> str | None:
-    """The year of the WOSAC scores, where all evaluations have one."""
+    """Return the year of the WOSAC scores, where all evaluations have one."""
     years = {entry.record.get("wosac", {}).get("config") for entry in entries}
     if len(years) > 1 and None not in years:
         raise ConfigError(f"WOSAC scores of {', '.join(sorted(years))}, choose with --evaluation")
@@ -271,13 +271,13 @@ def _check_comparable(entries: Sequence[Entry]) -> None:
 
 
 def _leaves(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a run by their names, such as ``search.branches``."""
+    """Return the settings of a run by their names, such as ``search.branches``."""
     parts = ((part, value if isinstance(value, dict) else {"": value}) for part, value in config.items())
     return {f"{part}.{name}".rstrip("."): value for part, values in parts for name, value in values.items()}
 
 
 def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
-    """What else must be known to read a table."""
+    """Return what else must be known to read a table."""
     record = entries[0].record
     notes = [
         f"{record['segments']} run segments in {record['data']['name']} ({record['data']['checksum'][:12]}); "

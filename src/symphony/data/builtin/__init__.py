@@ -7,5 +7,5 @@ from typing import Literal
 
 
 def builtin_store(split: Literal["train", "test"]) -> Path:
-    """Folder of the built-in store; the two splits share no road network."""
+    """Return the folder of a built-in store; the two splits share no road network."""
     return Path(__file__).parent / split

@@ -1,4 +1,4 @@
-"""What every reader of a log format offers, and what readers share."""
+"""The interface of all readers of log formats, and what they share."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError
 
 
 class UnexpectedError(DataError):
-    """A record that made a reader, or a library below it, fail in a way the reader did not foresee."""
+    """The error of a record on which a reader, or a library below it, failed in a way that it did not foresee."""
 
 
 class Reader(ABC):
@@ -44,7 +44,7 @@ class Reader(ABC):
     patterns: ClassVar[tuple[str, ...]]  # file-name patterns the format's files go by, for searching a folder
 
     def read(self, path: str | Path) -> Iterator[Item]:
-        """Yield one item per record of a file, in file order; no file makes it raise.
+        """Yield one item per record of a file, in file order; it never raises.
 
         A record that can't be used is yielded as an error naming file, segment (where known) and field. Where the
         rest of the file can't be read, such an error comes last.
@@ -71,7 +71,7 @@ class Reader(ABC):
             yield unexpected(error, file=path)
 
     def companions(self, path: Path) -> tuple[Path, ...]:
-        """Further files that a file of this format is read together with, such as its map; none by default."""
+        """Return the files that a file of this format is read together with, such as its map; none by default."""
         return ()
 
     @staticmethod
@@ -97,7 +97,7 @@ class Reader(ABC):
 
 @contextlib.contextmanager
 def located(*, file: object = None, segment: str | None = None, field: str | None = None) -> Iterator[None]:
-    """Add to a :class:`DataError` the places it does not name; with a field, malformed data raise one as well."""
+    """Add the missing places to a :class:`DataError`; with a field, malformed data raise one as well."""
     try:
         yield
     except DataError as error:
@@ -131,7 +131,7 @@ def refuse(wrong: object, message: str, field: str | None = None, *, file: objec
 
 
 def unexpected(error: Exception, *, file: object = None, segment: str | None = None) -> UnexpectedError:
-    """Return what a record is reported as that a reader fails on."""
+    """Return the error that stands for a record on which a reader fails."""
     message = f"can't be read: {type(error).__name__}: {str(error)[:200]}"
     return UnexpectedError(message, file=file, segment=segment)
 
@@ -223,8 +223,8 @@ def time_step(times: Doubles, field: str) -> float:
 
     They are rounded to the millisecond where that fits the log: at 15 or 30 Hz it would run up to a percent too fast
     or slow. Where steps are off by more than a tenth it is the usual one, to which
-    :func:`symphony.data.resample.evened` brings the log. A :class:`DataError` where more than a third of the steps
-    are no such ones, or half of them are missing.
+    :func:`symphony.data.resample.evened` brings the log. A :class:`DataError` says if more than a third of the steps
+    differ from it, or half of them are missing.
     """
     gaps = np.diff(times)
     mean = float(gaps.mean())
@@ -276,6 +276,6 @@ def by_ego(segment: RunSegment, candidates: NDArray[np.int64], egos: str) -> Ite
 
 
 def check_choice(name: str, value: str, *known: str) -> None:
-    """Raise a :class:`ConfigError` where an option of a reader is none of those known."""
+    """Raise a :class:`ConfigError` if an option of a reader has an unknown value."""
     if value not in known:
         raise ConfigError(f"{name} must be {' or '.join(map(repr, known))}, is {value!r}")

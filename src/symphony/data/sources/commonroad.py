@@ -1,13 +1,13 @@
 """Reader of CommonRoad scenarios: XML files of version 2018b or 2020a.
 
-An own reader, because every release of ``commonroad-io`` since 2023 pins protobuf 3.20, which nothing else here
-can live with, and the last that installs (2022.1) brings scipy and does not refuse XML entities.
+This is our own reader, since every release of ``commonroad-io`` since 2023 pins protobuf 3.20, which conflicts with
+all else here, and the last that installs (2022.1) brings scipy and does not refuse XML entities.
 
 - ``segment_id`` and ``group`` are the benchmark id. Steps run from the first to the last at which any dynamic
   obstacle exists. Coordinates are relative to the first position, in whole metres, of the ego ``egos="one"`` picks.
-- States are exact: predicted ones (intervals, regions, occupancies) are no logged motion. The velocity is the logged
-  speed along the logged orientation, or a difference of positions where none is logged. Static obstacles are at
-  rest; scenery (buildings, pillars, road boundaries, median strips) is left out.
+- States are exact: predicted ones (intervals, regions, occupancies) are not logged motion. The velocity is the logged
+  speed along the logged orientation, or a difference of positions where none is logged. Static obstacles are at rest;
+  scenery (buildings, pillars, road boundaries, median strips) is left out.
 - A lane is halfway between a lanelet's bounds. Sidewalks are left out, crosswalks are marks; shoulders, parking
   places and what is restricted belong to the drivable area, but are no lanes. The boundary is open at lanelets
   without successor or predecessor.

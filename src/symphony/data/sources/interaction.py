@@ -208,7 +208,7 @@ def _observed(rows: Rows, begin: int, stop: int) -> tuple[int, int]:
 
 
 def _lost(valid: Bools, dt: float) -> Bools:
-    """Return [T] steps at which a recording lost the frame: nobody is seen for at most :data:`.resample.MAX_GAP`."""
+    """Return [T] steps at which a recording lost the frame: no agent for at most :data:`.resample.MAX_GAP`."""
     lost = np.zeros(valid.shape[1], np.bool_)
     for before, after in pairwise(np.flatnonzero(valid.any(axis=0)).tolist()):
         lost[before + 1 : after] = (after - before) * dt <= MAX_GAP
@@ -227,7 +227,7 @@ def _sizes(rows: Rows, row: NDArray[np.int64], kind: NDArray[np.uint8]) -> Float
 
 @dataclass(frozen=True)
 class _Scene:
-    """What the windows of one file share; ``start`` is the time of step 0 in milliseconds."""
+    """The data that the windows of one file share; ``start`` is the time of step 0 in milliseconds."""
 
     files: Files
     dt: float
@@ -269,7 +269,7 @@ def _scene(files: Files, rows: Rows, dt: float, start: float) -> _Scene:
 
 @dataclass(frozen=True)
 class Files:
-    """A file of tracks and what it is read with; ``single`` is one recording, not many cases."""
+    """A file of tracks and the files that it is read with; ``single`` means one recording, not many cases."""
 
     tracks: Path
     part: str
@@ -282,7 +282,7 @@ class Files:
 
 
 def find_files(path: Path) -> Files:
-    """Return what a file of tracks is read with; a :class:`DataError` if it is named otherwise, or has no map."""
+    """Return the files that a file of tracks is read with; a :class:`DataError` for an odd name or a missing map."""
     numbered, split = _NUMBERED.fullmatch(path.name), _SPLIT.fullmatch(path.name)
     if numbered is None:
         if split is None:
@@ -298,7 +298,7 @@ def find_files(path: Path) -> Files:
 
 
 def _map(path: Path, scene: str, *, alone: bool) -> Path:
-    """Return the map of a place; if ``alone``, a single map beside the tracks does, whatever its name."""
+    """Return the map of a place; if ``alone``, a single map beside the tracks is taken, whatever its name."""
     for folder in (path.parent, path.parent.parent / "maps", path.parent.parent.parent / "maps"):
         for suffix in ("osm_xy", "osm"):
             if (folder / f"{scene}.{suffix}").is_file():

@@ -87,7 +87,7 @@ def read_rows(path: Path) -> Rows:
 
 
 def _ascii(data: bytes, first: int) -> str:
-    """Return the text of some lines of a file, of which the first has that number."""
+    """Return the text of some lines of a file, the first of which has the number ``first``."""
     try:
         return data.decode("ascii")
     except UnicodeDecodeError as error:
@@ -96,13 +96,13 @@ def _ascii(data: bytes, first: int) -> str:
 
 
 def joined(*parts: Rows) -> Rows:
-    """Return the rows of all, by case, time and track."""
+    """Return the rows of all files, by case, time and track."""
     rows = Rows(*(np.concatenate(arrays) for arrays in zip(*(vars(p).values() for p in parts), strict=True)))
     return rows.take(np.lexsort((rows.track, rows.time, rows.case)))
 
 
 def _rows(names: list[str], text: str, first: int) -> Rows:
-    """Parse some lines of a file, of which the first has that number."""
+    """Parse some lines of a file, the first of which has the number ``first``."""
     lines = [line.rstrip("\r").split(",") for line in text.split("\n")[:-1]]
     for k, line in enumerate(lines):
         if len(line) != len(names):
@@ -161,7 +161,7 @@ def stepped(rows: Rows) -> tuple[Rows, float, float]:
     """Return (rows with numbers of steps for times, seconds per step, milliseconds at step 0) of a recording.
 
     Times may be rounded to milliseconds, so that the steps of 30 Hz look uneven, and frames may be missing. A
-    :class:`DataError` where there are fewer than two times, or they are no multiples of one step.
+    :class:`DataError` where there are fewer than two times, or they are not multiples of one step.
     """
     times, which = np.unique(rows.time, return_inverse=True)
     refuse(len(times) < 2, "fewer than two steps", "timestamp_ms")
@@ -261,7 +261,7 @@ def from_positions(state: Doubles, valid: Bools, dt: float) -> Doubles:
 
     Headings that are far off the motion become NaN, which :func:`headings` fills. They are compared with the motion
     at the nearest step at which the agent moves: trackers give 0 to what stands before it moves. An agent that never
-    moves keeps what was logged; that one drives backwards can't be told.
+    moves keeps what was logged; driving backwards can't be told.
     """
     # The line reaches over 4 sigma: at least to the next step.
     _, slope, _ = local_line(state[..., :2], valid, dt, max(SIGMA, dt / 4))

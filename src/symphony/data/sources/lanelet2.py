@@ -63,7 +63,7 @@ class Way:
     tags: Tags
 
     def turned(self) -> Way:
-        """Return the same in the other direction."""
+        """Return the way in the other direction."""
         return Way(self.nodes[::-1], self.line[::-1], self.tags)
 
 
@@ -80,7 +80,7 @@ class Lanelet:
 
     @property
     def subtype(self) -> str:
-        """``road`` where the map does not say."""
+        """The subtype; ``road`` where the map does not name it."""
         return self.tags.get("subtype", "road")
 
     @property
@@ -90,7 +90,7 @@ class Lanelet:
 
     @property
     def bounds(self) -> tuple[Doubles, Doubles]:
-        """Both bounds with as many points."""
+        """Both bounds, with the same number of points."""
         return lines.matched(self.left.line, self.right.line, f"lanelet {self.lanelet_id}")
 
     @property
@@ -373,7 +373,7 @@ def stop_line(lane: Lanelet, rules: Rules) -> Doubles | None:
 
 
 def utm(places: Doubles, origin: Doubles) -> Doubles:
-    """Universal Transverse Mercator on WGS 84, in the zone of the origin, relative to the origin.
+    """Project by Universal Transverse Mercator on WGS 84, in the zone of the origin, relative to the origin.
 
     Lanelet2's and INTERACTION's usual projection (there about latitude and longitude 0). Krüger's series to the
     fourth order in the third flattening (Karney, 2011, arXiv:1002.1417, eq. 35): well below a millimetre inside a
@@ -408,7 +408,7 @@ def utm(places: Doubles, origin: Doubles) -> Doubles:
 
 
 def mercator(places: Doubles, origin: Doubles) -> Doubles:
-    """Spherical Mercator, scaled to be true to length at the origin, relative to the origin.
+    """Project by the spherical Mercator, scaled to be true to length at the origin, relative to the origin.
 
     The projection of the Test Area Autonomous Driving Baden-Württemberg recordings, and of Lanelet2's
     ``SphericalMercatorProjector``. Arguments, result and errors are those of :func:`utm`.

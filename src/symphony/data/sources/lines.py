@@ -30,7 +30,7 @@ SLIT = 0.1  # metres by which neighbouring areas may miss each other on either s
 
 @dataclass(frozen=True)
 class Lane:
-    """A lane in the coordinates and by the ids of its source; NaN is what is unknown."""
+    """A lane in the coordinates and by the ids of its source; unknown values are NaN."""
 
     name: Any
     line: Doubles  # [P, 2 or 3] centre line in the direction of travel
@@ -117,7 +117,7 @@ def evenly(line: Doubles, count: int) -> Doubles:
 
 
 def matched(left: Doubles, right: Doubles, field: str) -> tuple[Doubles, Doubles]:
-    """Return both bounds of a lane with as many points, evenly and at most :data:`SPACING` apart."""
+    """Return both bounds of a lane with equally many points, evenly and at most :data:`SPACING` apart."""
     longest = max(np.hypot(*np.diff(line, axis=0).T).sum() for line in (left, right))
     refuse(not longest <= MAX_BOUND, f"a lane of {longest:.4g} m, at most {MAX_BOUND:g}", field)
     count = max(int(np.ceil(longest / SPACING)) + 1, 2)
@@ -125,7 +125,7 @@ def matched(left: Doubles, right: Doubles, field: str) -> tuple[Doubles, Doubles
 
 
 def median_width(left: Doubles, right: Doubles) -> float:
-    """Return the metres between two bounds with as many points."""
+    """Return the metres between two bounds with equally many points."""
     return float(np.median(np.hypot(*(left - right).T)))
 
 
@@ -133,7 +133,7 @@ def drivable_rings(outlines: Sequence[Any], field: str = "lanelet") -> tuple[Dou
     """Return closed rings [P, 2] around the union of outlines, inside on the left; holes run the other way.
 
     Outlines are points [P, 2] or polygons. Slits and holes up to 2 * :data:`SLIT` wide are closed. A
-    :class:`DataError` says of which ``field`` the union can't be formed, or would be beyond all measure.
+    :class:`DataError` says of which ``field`` the union can't be formed, or would take too long.
     """
     shapes = [outline for outline in outlines if isinstance(outline, shapely.Polygon)]
     flat = [outline[:, :2] for outline in outlines if not isinstance(outline, shapely.Polygon)]
@@ -156,7 +156,7 @@ def _rings(polygons: Iterable[shapely.Polygon]) -> list[Doubles]:
 
 
 def _check_effort(outlines: Sequence[Doubles], field: str) -> None:
-    """Refuse outlines that are too many, or cross each other or themselves without end."""
+    """Refuse outlines that are too many, or cross each other or themselves too often."""
     count = sum(map(len, outlines))
     refuse(count > MAX_EDGES, f"outlines of {count} points, at most {MAX_EDGES}", field)
     if count == 0:

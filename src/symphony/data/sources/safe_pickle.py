@@ -37,7 +37,7 @@ MAX_ITEM = 4096  # bytes of one element of an array: texts of up to 1024 charact
 
 
 class _Named:
-    """What a name in a pickle stands for; nothing can be set on it from there."""
+    """The stand-in for a name in a pickle; nothing can be set on it from there."""
 
     __slots__ = ("_function",)
 
@@ -72,7 +72,7 @@ class _Type:
 
 
 class Array:
-    """An array of a pickle; ``value`` is it, once its state was given."""
+    """An array of a pickle; ``value`` holds it once its state was given."""
 
     __slots__ = ("value",)
 
@@ -113,7 +113,7 @@ for _core in ("core", "_core"):
 
 class _Plain(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        """Return one of a few names, none of which is what it says."""
+        """Return the stand-in for one of a few allowed names."""
         refuse((module, name) not in _NAMES, f"refers to {module}.{name}, which no plain data needs")
         return _NAMES[module, name]
 

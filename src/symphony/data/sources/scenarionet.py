@@ -347,7 +347,7 @@ def _cuts(lanes: Sequence[Lane], links: Links) -> Doubles:
 
 
 def _points(value: Any) -> Doubles:
-    """Return [P, 2 or 3] points, however they are written; refuse what is none, or not finite."""
+    """Return [P, 2 or 3] points in any notation; refuse what are no points, or not finite."""
     if isinstance(value, list | tuple):
         rows = [row.value.tolist() if isinstance(row, Array) else row for row in value]
         # Looked at one by one: lists in lists may be larger than any memory.

@@ -48,8 +48,8 @@ def generate_run(
 
     A kind is one of :data:`KINDS`, or a file of roads of one's own (:data:`.networks.OWN_ROADS`); another seed is
     another network. ``duration`` is what is recorded, in seconds, after a warm-up. ``rule`` says how maps and egos
-    are chosen, and how long segments are; by default the kind's own for 10 s. At a junction a route goes ``straight``
-    on so many times likelier than it takes one of the turns. A :class:`ConfigError` says what is wrong with an
+    are chosen, and how long segments are; by default the kind's own for 10 s. At a junction a route is ``straight``
+    times as likely to go straight on as to take any one turn. A :class:`ConfigError` says what is wrong with an
     argument, a :class:`DataError` if SUMO is not installed or failed, with its message.
     """
     own, ramp = is_own(kind), kind == "ramp"

@@ -42,7 +42,7 @@ class CropRule:
 
 
 def crop_rule(kind: str, seconds: float = 10.0, interactive: int = 2) -> CropRule:
-    """Return the kind's rule for segments of so many seconds.
+    """Return the kind's rule for segments of the given length.
 
     Longer segments get larger maps, so that a vehicle which drives on has road ahead of it to the end; freeways need
     longer maps for the same ten seconds, and from fewer points of the network, as those maps overlap more.

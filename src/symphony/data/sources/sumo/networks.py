@@ -317,7 +317,7 @@ def _carriageway(net: PlainNetwork, rng: Random, name: str, road: Road, course: 
     shift, median, spin = stations[-1] / 2, 5.0, _rotation(direction)
 
     def along(s: Doubles, right: float | Doubles) -> Doubles:
-        """Return points at stations s, so far to the right of the edge of the median."""
+        """Return points at stations s, this far to the right of the edge of the median."""
         u = s - shift
         normal = np.stack([curvature * u, -np.ones_like(u)], -1)
         out = np.stack([u, curvature * u**2 / 2], -1) + normal * (median + np.asarray(right))[..., None]

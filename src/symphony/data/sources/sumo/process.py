@@ -25,7 +25,7 @@ SETTLED = 60.0  # seconds after which a folder without an owner is not one that 
 
 @contextlib.contextmanager
 def scratch() -> Iterator[Path]:
-    """Make a temporary folder; those that processes left which were killed are removed first."""
+    """Make a temporary folder; those that killed processes left behind are removed first."""
     for folder in Path(tempfile.gettempdir()).glob(f"{SCRATCH}*"):
         _remove_left(folder)
     with tempfile.TemporaryDirectory(prefix=SCRATCH) as name, store_format.lock(Path(name)):

@@ -52,7 +52,7 @@ class Network:
         return [edge for edge in range(len(lanes)) if lanes[edge] > 0 and edge not in entered]
 
     def edge_graph(self) -> tuple[list[list[int]], Doubles, NDArray[np.int64]]:
-        """Return of each edge outside junctions those that follow, its length and its number of lanes.
+        """Return for each edge outside junctions the edges that follow, its length and its number of lanes.
 
         Edges inside junctions have no followers, length 0 and 0 lanes.
         """
@@ -83,7 +83,7 @@ class Network:
 
 
 def shape(text: str) -> Doubles:
-    """Return the points [P, 2] of a shape in SUMO's words."""
+    """Return the points [P, 2] of a shape in SUMO's notation."""
     return np.array([[float(c) for c in p.split(",")[:2]] for p in text.split()])
 
 

@@ -77,11 +77,11 @@ def write_demand(
     sublane: bool,
     straight: float = 1.0,
 ) -> Floats:
-    """Write vehicle types and vehicles, with routes that last for so many seconds, into the file :data:`ROUTES`.
+    """Write vehicle types and vehicles, with routes that last ``duration`` seconds, into the file :data:`ROUTES`.
 
     If ``through``, traffic enters at the sources of the network during the whole run and leaves it at the end; if
-    ``around``, a fixed number of vehicles starts everywhere. A route is a random walk that goes straight on at a
-    junction so many times likelier than it takes one of the turns. Returns of vehicle k (its id in SUMO) the box [3].
+    ``around``, a fixed number of vehicles starts everywhere. A route is a random walk, at junctions ``straight``
+    times as likely to go straight on as to take any one turn. Returns the box [3] of each vehicle k (its id in SUMO).
     """
     types, sizes, shares = _types(rng, sublane)
     following, length, lanes = network.edge_graph()
