@@ -31,8 +31,8 @@ def naming(path: Path) -> Iterator[None]:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a draft of the same suffix, which replaces ``path`` at the end of the block; make its folder.
 
-    If the block fails, what was at ``path`` stays as it was. Links are followed, and what is no ordinary file (a
-    terminal, a pipe) is written to as it is. Raises a :class:`DataError` if the disk refuses.
+    If the block fails, what was at ``path`` stays as it was. Links are followed, and what is not an ordinary file (a
+    terminal, a pipe) is written to directly. Raises a :class:`DataError` if the disk refuses.
     """
     with naming(path):
         place = _place(path)
@@ -94,7 +94,7 @@ def finite(value: Any) -> Any:
 
 
 class Lock(AbstractContextManager["Lock"]):
-    """Keeps other writers, who are told of it, out of a folder or a file until it is closed or this process ends.
+    """Keeps other writers, who get an error, out of a folder or a file until it is closed or this process ends.
 
     The file at ``path``, removed in the end, stands for the ``output``, by default its folder, which is made.
     """

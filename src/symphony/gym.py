@@ -1,4 +1,4 @@
-"""Registers what ``gymnasium.make("symphony.gym:symphony/Driving-v0", data="store")`` makes (the extra ``gym``)."""
+"""Registers the environment of ``gymnasium.make("symphony.gym:symphony/Driving-v0", data="store")`` (extra "gym")."""
 
 try:
     import gymnasium

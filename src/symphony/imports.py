@@ -1,4 +1,4 @@
-"""Objects by import path, such as ``my.module:Name``: how users bring parts of their own."""
+"""Objects by import path, such as ``my.module:Name``: the way in which users bring their own parts."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from symphony.errors import ConfigError
 def load_object(path: str, *, here: bool = True) -> Any:
     """Import ``module:name``, or ``path/to/file.py:name``, with what lies beside the file to import.
 
-    Unless ``here`` is False, modules are looked for in the current folder, too, as ``python -m`` does. Not for paths
-    that the user did not type: whatever lies in the folder would run. A :class:`ConfigError` says what is not there,
-    or why it can't be imported.
+    Unless ``here`` is False, modules are also sought in the current folder, as ``python -m`` does. Not for paths that
+    the user did not type: whatever lies in the folder would run. A :class:`ConfigError` says what is missing, or why
+    it can't be imported.
     """
     module, _, name = path.rpartition(":")
     load = _file if module.endswith(".py") else importlib.import_module
@@ -40,7 +40,7 @@ def load_object(path: str, *, here: bool = True) -> Any:
 
 
 def build_object(path: str, *arguments: Any, **named: Any) -> Any:
-    """Call what an import path names; a :class:`ConfigError` if it can't be imported or called so."""
+    """Call the object of an import path; a :class:`ConfigError` if it can't be imported or called like this."""
     found = load_object(path)
     try:
         return found(*arguments, **named)
@@ -49,7 +49,7 @@ def build_object(path: str, *arguments: Any, **named: Any) -> Any:
 
 
 def _file(name: str) -> Any:
-    """A file as a module, run once."""
+    """Return a file as a module, run once."""
     path = Path(name).resolve()
     if str(path) in sys.modules:
         return sys.modules[str(path)]
@@ -69,7 +69,7 @@ def _file(name: str) -> Any:
 def lazily(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return ``__getattr__`` and ``__dir__`` of a package whose names are imported when they are asked for.
 
-    Its ``if TYPE_CHECKING`` block says where they are from. A name must not be that of a module of the package, too.
+    Its ``if TYPE_CHECKING`` block says where they are from. A name must not also be that of a module of the package.
     """
     source = Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8")
     nodes = [node for block in ast.parse(source).body if isinstance(block, ast.If) for node in block.body]

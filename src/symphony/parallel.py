@@ -1,4 +1,4 @@
-"""A function applied to many tasks, in other processes of this machine or on a Ray cluster."""
+"""Parallel application of a function to tasks, in processes of this machine or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _START: Literal["forkserver", "spawn"] = "forkserver" if sys.platform == "linux"
 
 
 class WorkerError(SymphonyError):
-    """A worker process ended before its task was done: one of ``tasks``, numbers from 0 of those under way."""
+    """The error of a worker process that ended before its task was done: one of ``tasks``, the numbers under way."""
 
     def __init__(self, tasks: list[int]) -> None:
         why = "killed (out of memory?), crashed, or started in a script without `if __name__ == '__main__':`"
@@ -49,13 +49,13 @@ def ordered_map(
     engine: Engine = "local",
     imports: Sequence[str] = (),
 ) -> Results[R]:
-    """Apply a function of a module to every task; results come in the order of the tasks, whoever is done first.
+    """Apply a function of a module to every task; results come in the order of the tasks, whichever is done first.
 
-    Tasks are taken as results are asked for, at most ``2 * workers`` ahead. One local worker is this very process.
-    An error, an interrupt or ``close`` abandons the tasks under way. What ``function`` raises comes through; a worker
+    Tasks are taken as results are requested, at most ``2 * workers`` ahead. One local worker is this very process. An
+    error, an interrupt or ``close`` abandons the tasks under way. What ``function`` raises comes through; a worker
     that dies is a :class:`WorkerError`. ``engine`` is ``local`` for processes of this machine or ``ray`` for the
-    cluster at ``RAY_ADDRESS`` or that ``ray.init`` was called for, else one on this machine. ``imports`` are modules
-    that local workers need beside the function's own.
+    cluster at ``RAY_ADDRESS`` or the one of ``ray.init``, else one on this machine. ``imports`` are modules that
+    local workers need beside the function's own.
     """
     if workers < 1:
         raise ConfigError(f"workers must be at least 1, is {workers}")
@@ -79,7 +79,7 @@ def get_ready(imports: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
-    """Processes started inside have the environment of workers and put off interrupts: the parent's are enough."""
+    """Give processes started inside the environment of workers; they put off interrupts: the parent's are enough."""
     before = {name: os.environ[name] for name in WORKER_ENVIRONMENT if name in os.environ}
     try:
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

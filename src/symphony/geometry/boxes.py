@@ -29,7 +29,7 @@ _SLOW = 1e-9
 def meeting_time(
     way: Pairs, speed: Pairs, heading_a: Angles, size_a: Pairs, heading_b: Angles, size_b: Pairs
 ) -> Reals:
-    """When boxes that keep velocity and heading first overlap: 0 for now, infinity for never.
+    """Return when boxes that keep velocity and heading first overlap: 0 for now, infinity for never.
 
     On each of the four face normals their shadows overlap from one time to another; the boxes do where all four do
     (the separating-axis test of moving boxes). Boxes that only touch do not meet.
@@ -61,11 +61,11 @@ def contact_share(
     heading_b: Pairs,
     size_b: Pairs,
 ) -> Reals:
-    """Share of a step, from 0 to 1, after which two boxes first overlap; infinity where they don't.
+    """Return the share of a step, from 0 to 1, after which two boxes first overlap; infinity where they don't.
 
     Centres move straight and headings turn evenly from the first of two poses to the second. Boxes that overlap at
-    both poses are in contact from the first on; those that overlap at the first only part in this step, and what they
-    did counts for the step before. Who was not there before gets the second pose twice.
+    both poses are in contact from the first on; those that overlap at the first only part in this step, and their
+    contact belongs to the step before. An agent that was not there before gets the second pose twice.
 
     A box turns the shorter way to a heading or its opposite, which is the same box.
     """
@@ -108,7 +108,7 @@ def contact_share(
 def pose_at(
     center: Float[Tensor, "*batch 2 2"], heading: Float[Tensor, "*batch 2"], share: Reals
 ) -> tuple[Float[Tensor, "*batch 2"], Reals]:
-    """Centre and heading after a share of a step, as :func:`contact_share` moves boxes."""
+    """Return centre and heading after a share of a step, as :func:`contact_share` moves boxes."""
     turn = 0.5 * wrap(2.0 * (heading[..., 1] - heading[..., 0]))
     place = center[..., 0, :] + share[..., None] * (center[..., 1, :] - center[..., 0, :])
     return place, heading[..., 0] + share * turn
@@ -118,7 +118,7 @@ _CORNER_SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 
 
 def box_corners(center: Pairs, heading: Angles, size: Pairs) -> Float[Tensor, "*batch 4 2"]:
-    """Corners counter-clockwise: front left, rear left, rear right, front right."""
+    """Return corners counter-clockwise: front left, rear left, rear right, front right."""
     local = 0.5 * size[..., None, :] * constant(_CORNER_SIGNS, size.dtype, size.device)
     cos, sin = torch.cos(heading)[..., None], torch.sin(heading)[..., None]
     x, y = local[..., 0], local[..., 1]
@@ -128,7 +128,7 @@ def box_corners(center: Pairs, heading: Angles, size: Pairs) -> Float[Tensor, "*
 def boxes_overlap(
     center_a: Pairs, heading_a: Angles, size_a: Pairs, center_b: Pairs, heading_b: Angles, size_b: Pairs
 ) -> Bool[Tensor, "*batch"]:
-    """Whether the two boxes overlap, by the separating-axis test.
+    """Return whether the two boxes overlap, by the separating-axis test.
 
     Boxes that only touch do not overlap. A box without area (a point or a line) overlaps another one if it
     reaches strictly inside that one; two coincident points do not overlap. The result is the same with the
@@ -141,7 +141,7 @@ def boxes_overlap(
 def box_gap(
     center_a: Pairs, heading_a: Angles, size_a: Pairs, center_b: Pairs, heading_b: Angles, size_b: Pairs
 ) -> Reals:
-    """Signed distance between two boxes, in metres.
+    """Return the signed distance between two boxes, in metres.
 
     Apart: the Euclidean gap. Overlapping: minus the penetration depth, the length of the shortest translation
     that separates them. Differentiable in every argument, with finite gradients everywhere.
@@ -150,7 +150,7 @@ def box_gap(
 
 
 def gap_between(x: Angles, y: Angles, heading_a: Angles, size_a: Pairs, heading_b: Angles, size_b: Pairs) -> Reals:
-    """:func:`box_gap` of boxes whose centres are ``x`` and ``y`` metres apart, seen from a."""
+    """Return :func:`box_gap` of boxes whose centres are ``x`` and ``y`` metres apart, seen from a."""
     pair = relation(x, y, heading_a, heading_b)
     separation, back = _separations(pair, size_a, size_b), (-pair.in_b[0], -pair.in_b[1])
     # Of two disjoint convex polygons the nearest points include a corner of one of them.
@@ -166,7 +166,7 @@ _Plane = tuple[Angles, Angles]
 
 
 class _Pair(NamedTuple):
-    """Where box b is relative to box a, everything relative so that large coordinates cost no precision.
+    """The pose of box b relative to box a, so that large coordinates cost no precision.
 
     Attributes:
         in_a: the way from a's centre to b's, along and across a.
@@ -184,19 +184,19 @@ def _way(center_a: Pairs, center_b: Pairs) -> _Plane:
 
 
 def relation(x: Angles, y: Angles, heading_a: Angles, heading_b: Angles) -> _Pair:
-    """Where a box is whose centre is ``x`` and ``y`` metres from that of box a."""
+    """Return the relation of box a to one whose centre is ``x`` and ``y`` metres from its own."""
     turn = heading_b - heading_a
     return _Pair(turned(x, y, heading_a), turned(x, y, heading_b), (torch.cos(turn), torch.sin(turn)))
 
 
 def turned(x: Angles, y: Angles, heading: Angles) -> _Plane:
-    """A vector along and across a heading."""
+    """Return the parts of a vector along and across a heading."""
     cos, sin = torch.cos(heading), torch.sin(heading)
     return cos * x + sin * y, cos * y - sin * x
 
 
 def _separations(pair: _Pair, size_a: Pairs, size_b: Pairs) -> Tensor:
-    """Largest separation along the four face normals: negative where the boxes overlap."""
+    """Return largest separation along the four face normals: negative where the boxes overlap."""
     # Each box's axes are treated alike, so that swapping the boxes gives the same bits.
     cover = covers(pair.turn, size_a, size_b)
     places = (pair.in_a[0], pair.in_a[1], pair.in_b[0], pair.in_b[1])
@@ -205,7 +205,7 @@ def _separations(pair: _Pair, size_a: Pairs, size_b: Pairs) -> Tensor:
 
 
 def covers(turn: _Plane, size_a: Pairs, size_b: Pairs) -> tuple[Tensor, ...]:
-    """How far apart centres may be for the boxes to overlap, along and across a, and along and across b."""
+    """Return how far apart centres may be for the boxes to overlap, along and across a, and along and across b."""
     cos, sin = (part.abs() for part in turn)
     length_a, width_a = 0.5 * size_a[..., 0], 0.5 * size_a[..., 1]
     length_b, width_b = 0.5 * size_b[..., 0], 0.5 * size_b[..., 1]
@@ -218,7 +218,7 @@ def covers(turn: _Plane, size_a: Pairs, size_b: Pairs) -> tuple[Tensor, ...]:
 
 
 def _corner_distance(way: _Plane, turn: _Plane, size: Pairs, other_size: Pairs) -> Tensor:
-    """Smallest distance of the other box's corners from this box (0 inside).
+    """Return smallest distance of the other box's corners from this box (0 inside).
 
     Takes the way to the other's centre, along and across this one, and cosine and sine of the other's heading
     relative to this one's.

@@ -1,8 +1,8 @@
 """Square cells over the maps of a batch, with lists of the only elements that can matter to a position inside.
 
 A position q in a cell lies within half the cell's diagonal h of its centre c, so any distance from q differs by at
-most h from that from c: what is more than 2 h farther from c than the k-th nearest element is not among the k
-nearest of q. A list is made when somebody is in its cell. For the CPU only.
+most h from that from c: what is more than 2 h farther from c than the k-th nearest element is not among the k nearest
+of q. A list is made when a position is in its cell. For the CPU only.
 
 Shapes: B maps of P points or E edges, R positions. Element i of map b is number ``b * P + i`` of all.
 """
@@ -38,10 +38,10 @@ _FILLING = Lock()
 
 
 class Cells(ABC):
-    """The cells of B maps, and lists for those that somebody has been in.
+    """The cells of B maps, and lists for those in which positions were.
 
     Takes the corners [B, 2] of what is on each map in metres, whether it has cells at all [B], the least side of a
-    cell, the elements per map, padding included, and how many are looked for.
+    cell, the elements per map, padding included, and how many are wanted.
     """
 
     def __init__(self, low: Reals, high: Reals, some: Bools, size: float, *, total: int, wanted: int = 1) -> None:
@@ -66,14 +66,14 @@ class Cells(ABC):
 
     @abstractmethod
     def _squared(self, scene: Indices, x: Reals, y: Reals) -> Reals:
-        """Squared metres [C, elements of a map] from centres x and y [C, 1]; infinity where there is no element."""
+        """Return squared metres [C, elements of a map] from centres x and y [C, 1]; infinity without an element."""
 
     def _signs(self, x: Reals, y: Reals, count: Indices, item: Indices, half: Reals) -> NDArray[np.int8]:
-        """1 or -1 for cells [C] of which every position is off or on the road, 0 where it depends on the position."""
+        """Return 1 or -1 for cells [C] that lie off or on the road, 0 where it depends on the position."""
         return np.zeros(len(x), np.int8)
 
     def locate(self, scene: Indices, x: Reals, y: Reals) -> Indices:
-        """Number of the cell in which each position of map ``scene`` lies, -1 outside of its cells."""
+        """Return the number of the cell in which each position of map ``scene`` lies, -1 outside its cells."""
         per_metre, columns = self.per_metre.take(scene), self.columns.take(scene)
         column = np.floor((x - self.x.take(scene)) * per_metre)
         row = np.floor((y - self.y.take(scene)) * per_metre)
@@ -81,8 +81,8 @@ class Cells(ABC):
         return np.where(inside, row * columns + column + self.first.take(scene), -1.0).astype(np.int64)
 
     def at(self, scene: Indices, x: Reals, y: Reals, repaid: int = 1) -> Indices:
-        """What :meth:`locate` gives, and -1 for cells that have no list: those have one that so many positions [R]
-        have been in by now.
+        """Return the cells of :meth:`locate`, but -1 for those without a list: a cell gets one once ``repaid``
+        positions [R] have been in it.
         """
         cell = self.locate(scene, x, y)
         inside = np.flatnonzero(cell >= 0)
@@ -90,7 +90,7 @@ class Cells(ABC):
         return cell
 
     def listed(self, scene: Indices, cell: Indices, repaid: int = 1) -> Bools:
-        """Whether the cells [R] of maps [R] have lists: those do that so many positions have been in by now."""
+        """Return whether cells [R] of maps [R] have lists, as they do once ``repaid`` positions were in them."""
         new = np.flatnonzero(self.begin.take(cell) < 0)
         if len(new) == 0:
             return np.ones(len(cell), np.bool_)
@@ -131,8 +131,8 @@ class Cells(ABC):
 class PointCells(Cells):
     """Cells for the nearest points.
 
-    Takes x and y of the points [B, P], infinity where there is none, and how many are looked for: a map with few more
-    has no cells.
+    Takes x and y of the points [B, P], infinity where there is none, and how many are wanted: a map with few more has
+    no cells.
     """
 
     def __init__(self, x: Reals, y: Reals, count: int) -> None:
@@ -151,7 +151,7 @@ class PointCells(Cells):
         return np.square(points_x - x) + np.square(points_y - y)
 
     def nearest_points(self, cell: Indices, x: Reals, y: Reals) -> Indices:
-        """Numbers [R, K] of the points nearest to positions [R] in cells that have lists, ascending."""
+        """Return the numbers [R, K] of the points nearest to positions [R] in cells that have lists, ascending."""
         points_x, points_y = (points.ravel() for points in self.points)
         found = np.empty((len(cell), self.wanted), np.int64)
         for a in range(0, len(cell), ROWS):
@@ -212,7 +212,7 @@ class EdgeCells(Cells):
         return np.where(lowest == highest, lowest, 0).astype(np.int8)
 
     def _sides(self, x: Reals, y: Reals, edge: Indices, half: Reals) -> tuple[NDArray[np.int8], Bools, Bools]:
-        """Side of an edge on which a whole cell lies (0: on both), and whether any of it lies before or past it."""
+        """Return the side of an edge on which a whole cell lies (0: both), and whether part is before or past it."""
         start_x, start_y, unit_x, unit_y, half_length = self.edges[:, edge]
         away_x, away_y = x - start_x, y - start_y
         along, across = away_x * unit_x + away_y * unit_y, away_x * unit_y - away_y * unit_x
@@ -222,7 +222,7 @@ class EdgeCells(Cells):
         return side, along < spread, along > 2 * half_length - spread
 
     def nearest_edge(self, cell: Indices, x: Reals, y: Reals) -> Indices:
-        """Number [R] of the edge nearest to each position [R] in a cell that has a list."""
+        """Return the number [R] of the edge nearest to each position [R] in a cell that has a list."""
         held = self.count.take(cell)
         first = np.cumsum(held) - held
         # Pairs of a position and a candidate, position by position.
@@ -237,7 +237,7 @@ class EdgeCells(Cells):
         return nearest.astype(np.int64)
 
     def right_of(self, nearest: Indices, x: Reals, y: Reals) -> Bools:
-        """Whether positions [R] lie to the right of their nearest edges, as the sign of
+        """Return whether positions [R] lie to the right of their nearest edges, as the sign of
         :func:`symphony.geometry.signed_distance` says, in a third of the time.
         """
         along, right = self._beside(nearest, x, y)
@@ -258,7 +258,7 @@ class EdgeCells(Cells):
 
 
 def _squared_to(edges: Sequence[Reals] | Reals, x: Reals, y: Reals) -> Reals:
-    """Squared metres from positions to edges [5, ...] as :class:`EdgeCells` keeps them."""
+    """Return squared metres from positions to edges [5, ...] as :class:`EdgeCells` keeps them."""
     start_x, start_y, unit_x, unit_y, half = edges
     away_x, away_y = x - start_x, y - start_y
     beyond = np.maximum(np.abs(away_x * unit_x + away_y * unit_y - half) - half, 0)

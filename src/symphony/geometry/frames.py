@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def wrap(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """The same angle in [-pi, pi); one already there comes back bit for bit. The gradient is 1 everywhere."""
+    """Wrap an angle to [-pi, pi); one already there comes back bit for bit. The gradient is 1 everywhere."""
     turns = torch.floor((angle.detach() + math.pi) / (2 * math.pi))
     wrapped = angle - turns * (2 * math.pi)
     # Rounding can leave the result one turn off at either end of the interval.
@@ -28,12 +28,12 @@ def rotate(vectors: Float[Tensor, "*batch 2"], angle: Float[Tensor, "*#batch"]) 
 
 
 def forward_speed(velocity: Float[Tensor, "*batch 2"], heading: Float[Tensor, "*#batch"]) -> Float[Tensor, "*batch"]:
-    """Component of a velocity along a heading, m/s; negative when reversing."""
+    """Return the component of a velocity along a heading, m/s; negative when reversing."""
     return velocity[..., 0] * heading.cos() + velocity[..., 1] * heading.sin()
 
 
 def with_speed(moving: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 4"]:
-    """From x, y, heading and velocity to x, y, heading and speed along the heading."""
+    """Turn x, y, heading and velocity into x, y, heading and speed along the heading."""
     speed = forward_speed(moving[..., 3:], moving[..., 2])
     return torch.cat([moving[..., :3], speed[..., None]], -1)
 
@@ -43,13 +43,13 @@ LEVEL = 2.5
 
 
 def levels_apart(one: Float[Tensor, "*#b 2"], other: Float[Tensor, "*#b 2"]) -> Bool[Tensor, "*b"]:
-    """Whether two places, by height and level (0 for none), are on two of them."""
+    """Return whether two places, given by height and level (0 for none), are on different levels."""
     levels = (one[..., 1] != other[..., 1]) & (one[..., 1] > 0) & (other[..., 1] > 0)
     return levels & ((one[..., 0] - other[..., 0]).abs() >= LEVEL)
 
 
 def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Num[Tensor, "*_"]:
-    """A tensor of these (nested tuples of) numbers; shared, so never written to."""
+    """Return a tensor of (nested tuples of) numbers; it is shared, so never write to it."""
     if torch.compiler.is_compiling():
         return torch.tensor(values, dtype=dtype, device=device)
     return made(values, dtype, device)
@@ -57,7 +57,7 @@ def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) 
 
 @cache
 def made(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Num[Tensor, "*_"]:
-    """What :func:`constant` keeps."""
+    """Create the tensor that :func:`constant` keeps."""
     # Made outside of inference mode, or autograd could not save it.
     with torch.inference_mode(False), torch.no_grad():
         return torch.tensor(values, dtype=dtype).to(device)

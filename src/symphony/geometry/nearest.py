@@ -13,12 +13,12 @@ from torch.nn.functional import pad
 
 
 def has_values() -> bool:
-    """Whether values may be looked at: outside of ``torch.compile`` and of transforms of ``torch.func``."""
+    """Return whether values may be looked at: not inside ``torch.compile`` or transforms of ``torch.func``."""
     return not torch.compiler.is_compiling() and torch._C._functorch.peek_interpreter_stack() is None
 
 
 def on_host(tensor: Tensor) -> bool:
-    """Whether values may steer the computation: on the CPU, where there are any.
+    """Return whether values may steer the computation: on the CPU, where there are any.
 
     There a step may look at a few numbers to leave out work; elsewhere that would wait for the device.
     """
@@ -26,7 +26,7 @@ def on_host(tensor: Tensor) -> bool:
 
 
 def places(flags: Bool[Tensor, "M N"]) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
-    """Row and column of what is set; on a device, which would wait to tell, of everything."""
+    """Return row and column of what is set; on a device, which would wait to tell, of everything."""
     if on_host(flags):
         row, column = flags.nonzero(as_tuple=True)
         return row, column
@@ -35,15 +35,15 @@ def places(flags: Bool[Tensor, "M N"]) -> tuple[Int[Tensor, " P"], Int[Tensor, "
 
 
 def spans(begin: NDArray[np.int64] | int, length: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The numbers from ``begin`` on, ``length`` [R] of each, one after the other."""
+    """Return the numbers from ``begin`` on, ``length`` [R] of each, one after the other."""
     before = length.cumsum() - length
     return np.arange(length.sum()) + np.repeat(begin - before, length)
 
 
 def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
-    """Places, in the flattened array, of the ``count`` smallest elements of each row [R, W], ascending.
+    """Return the places, in the flattened array, of the ``count`` smallest of each row [R, W], ascending.
 
-    Of equal elements the first ones are taken, so what else is in a row decides nothing. NaN counts as infinity.
+    Of equal elements the first ones are taken, so the other elements of a row do not matter. NaN counts as infinity.
     """
     if values.shape[1] <= count:
         return np.arange(values.size)
@@ -61,7 +61,7 @@ def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
 
 
 def nearest(squared: Float[Tensor, "*b K"], count: int) -> tuple[Int[Tensor, "*b n"], Bool[Tensor, "*b n"]]:
-    """Index [..., count] of the smallest elements and which of them are finite; the rest is padded with index 0.
+    """Return the indices [..., count] of the smallest elements and which are finite; the rest is padded with index 0.
 
     Ties go to the elements that come first; on the CPU in ascending order of the index.
     """

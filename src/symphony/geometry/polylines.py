@@ -1,4 +1,4 @@
-"""Signed distance to oriented polylines, such as the edge of the road, and where along a line something is."""
+"""Signed distances to oriented polylines, such as the edge of the road, and places along a line."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def signed_distance(
     previous: Int[Tensor, "B E"] | None = None,
     following: Int[Tensor, "B E"] | None = None,
 ) -> Float[Tensor, "B M"]:
-    """Signed distance of points to the nearest oriented segment: positive on its right, negative on its left.
+    """Return the signed distance to the nearest oriented segment: positive on its right, negative on its left.
 
     With the drivable side on the left (see ``RoadMap.boundary``) positive means off the road. The absolute
     value is the Euclidean distance. Segments of no length and those not valid are ignored; a scene without
@@ -48,7 +48,7 @@ def signed_distance(
 
 
 def has_length(start: Float[Tensor, "B E 2"], end: Float[Tensor, "B E 2"]) -> Bool[Tensor, "B E"]:
-    """Which segments are more than a point."""
+    """Return which segments are longer than a point."""
     return (start[..., 0] != end[..., 0]) | (start[..., 1] != end[..., 1])
 
 
@@ -61,7 +61,7 @@ def distance_to(
     following: Int[Tensor, "B E"] | None,
     nearest: Int[Tensor, "B M"],
 ) -> Float[Tensor, "B M"]:
-    """What :func:`signed_distance` gives where the nearest segments are known; ``valid`` ones have a length."""
+    """Return :func:`signed_distance` where the nearest segments are known; ``valid`` ones have a length."""
     here = _Side(points, _take(start, nearest), _take(end, nearest))
     sign = here.sign
     for neighbor, beyond, ahead in (
@@ -77,7 +77,7 @@ def distance_to(
 
 
 class _Side:
-    """Where points [B, M, 2] lie relative to one segment each."""
+    """The position of points [B, M, 2] relative to one segment each."""
 
     def __init__(
         self, points: Float[Tensor, "B M 2"], start: Float[Tensor, "B M 2"], end: Float[Tensor, "B M 2"]
@@ -94,7 +94,7 @@ class _Side:
 
     @property
     def to_end(self) -> Float[Tensor, "B M"]:
-        """Distance to the nearer end."""
+        """The distance to the nearer end."""
         x, y, along_x, along_y = self._away
         beyond = self.fraction > 0.5
         gap = (x - beyond * along_x).square() + (y - beyond * along_y).square()
@@ -118,7 +118,7 @@ def _corner_sign(
     here: _Side,
     ahead: bool,
 ) -> Float[Tensor, "B M"]:
-    """Sign at a corner: right of either segment where the line turns left, of both where it turns right."""
+    """Return the sign at a corner: right of either segment if the line turns left, of both if it turns right."""
     index = neighbor.gather(1, nearest).long()
     exists = (index >= 0) & valid.gather(1, index.clamp(min=0))
     index = index.clamp(min=0)
@@ -140,7 +140,7 @@ def _nearest_segment(
     end: Float[Tensor, "B E 2"],
     valid: Bool[Tensor, "B E"],
 ) -> Int[Tensor, "B M"]:
-    """Index [B, M] of the nearest valid segment."""
+    """Return index [B, M] of the nearest valid segment."""
     batch, count, _ = points.shape
     # Coordinates relative to a point of the map keep float32 rounding well below a millimetre: halfway between the
     # outermost valid starts, 0 where there are none, so that no position has a say in it.
@@ -172,7 +172,7 @@ def _segment_axes(
     valid: Bool[Tensor, "B E"],
     center: Float[Tensor, "B 1 2"],
 ) -> Float[Tensor, "5 B E"]:
-    """Each segment's unit vector, offsets along (from its middle) and across, and half length: [5, B, E].
+    """Return each segment's unit vector, offsets along (from its middle) and across, and half length: [5, B, E].
 
     Component by component: operations on a last dimension of 2 are ten times slower.
     """
@@ -195,10 +195,10 @@ def segments_of(
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.int64], NDArray[np.int64]]:
     """Cut ragged polylines into the segments :func:`signed_distance` takes.
 
-    Line k is ``points[offsets[k]:offsets[k + 1]]``. A line whose last point lies within :data:`CLOSED_WITHIN`
-    of its first one is a ring; a line that starts where exactly one other line ends continues it. Repeated
-    points are dropped. Gives start [E, 2], end [E, 2], and the indices [E] of the previous and the following segment
-    (-1: none).
+    Line k is ``points[offsets[k]:offsets[k + 1]]``. A line whose last point lies within :data:`CLOSED_WITHIN` of its
+    first one is a ring; a line that starts where exactly one other line ends continues it. Repeated points are
+    dropped. Returns start [E, 2], end [E, 2], and the indices [E] of the previous and the following segment (-1:
+    none).
     """
     points = np.asarray(points)[:, :2]
     counts = np.diff(offsets)
@@ -235,10 +235,10 @@ def stations_along(
     path: Float[NDArray[np.float64], "R U 2"],
     valid: Bool[NDArray[np.bool_], "R U"],
 ) -> Float[NDArray[np.float64], "R U"]:
-    """Metres along each line of the points of a path that follows it; NaN where it is not valid.
+    """Return the metres along each line of the points of a path that follows it; NaN where it is not valid.
 
-    A path begins at the earliest place that is nearest to it, or nearly so, and goes on from there: a step leads no
-    farther along the line than the way that was driven, and some metres.
+    A path begins at the earliest place that is nearest to it, or nearly so, and goes on from there: a step leads at
+    most as far along the line as was driven, and some metres.
 
     Shorter lines end with their last point again. Raises ValueError where a point that exists is not finite; names
     line and step.
@@ -274,7 +274,7 @@ def stations_along(
 def _reach(
     path: Float[NDArray[np.float64], "R U 2"], valid: Bool[NDArray[np.bool_], "R U"]
 ) -> Float[NDArray[np.float64], "R U"]:
-    """Metres along the line within which the next place is looked for, from the last point that exists."""
+    """Return metres along the line within which the next place is sought, from the last point that exists."""
     steps = np.arange(path.shape[1])
     before = np.maximum.accumulate(np.where(valid, steps, 0), 1)[:, :-1]
     last = np.take_along_axis(path, before[..., None], 1)
@@ -283,7 +283,7 @@ def _reach(
 
 
 def earliest_pass(distance: Float[NDArray[np.float64], "*b pieces"]) -> NDArray[np.int64]:
-    """The first piece of a line that is nearer than those beside it, and nearly the nearest of all."""
+    """Return the first piece of a line that is nearer than those beside it, and nearly the nearest of all."""
     beside = np.pad(distance, [(0, 0)] * (distance.ndim - 1) + [(1, 1)], constant_values=np.inf)
     lowest = (distance <= beside[..., :-2]) & (distance <= beside[..., 2:])
     return (lowest & (distance <= distance.min(-1, keepdims=True) + NEAR)).argmax(-1)
@@ -292,8 +292,8 @@ def earliest_pass(distance: Float[NDArray[np.float64], "*b pieces"]) -> NDArray[
 def to_pieces(
     start: Reals, direction: Reals, length: Reals, point: NDArray[np.floating]
 ) -> tuple[Reals, Reals, Reals]:
-    """Metres along each piece of a line to its place nearest to a point, what lies between the two [..., 2], and how
-    far that is. Pieces have a start [..., 2], a unit direction (zero for pieces of no length) and a length [...].
+    """Return metres along each piece of a line to its place nearest to a point, and the vector [..., 2] and distance
+    between the two. Pieces have a start [..., 2], a unit direction (zero for no length) and a length [...].
     """
     # Component by component: sums over a last dimension of 2 are slow.
     x, y = (point[..., k] - start[..., k] for k in (0, 1))

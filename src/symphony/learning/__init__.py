@@ -1,4 +1,4 @@
-"""Data to learn from: demonstrations prepared from logs, and the rollouts of a search."""
+"""Data to learn from: demonstrations prepared from logs, and rollouts found by a search."""
 
 from __future__ import annotations
 

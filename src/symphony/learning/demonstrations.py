@@ -40,13 +40,13 @@ DISPLACED = 2.0
 
 
 def evenly_spaced(total: int, count: int) -> list[int]:
-    """Numbers below ``total``, evenly spaced from 0 on: ``count`` of them, or all if there are fewer."""
+    """Return ``count`` numbers below ``total``, evenly spaced from 0 on, or all if there are fewer."""
     count = min(count, total)
     return [k * total // count for k in range(count)]
 
 
 def room() -> int:
-    """Bytes a cache may hold; processes of one training share the machine."""
+    """Return the bytes that a cache may hold; processes of one training share the machine."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return int(SHARE * total) // max(1, int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
@@ -60,7 +60,7 @@ class ItemCache(Generic[T]):
         make: gives the values of some items, in their order.
         size: gives the bytes of a value.
         keep: items held at most; None for no bound.
-        limit: bytes held at most, beyond what was asked for last; :func:`room` by default.
+        limit: bytes held at most, beyond the last request; :func:`room` by default.
         name: of what is held, for the warning.
 
     Attributes:
@@ -82,11 +82,11 @@ class ItemCache(Generic[T]):
         self._held, self._warned = 0, False
 
     def __call__(self, item: int) -> T:
-        """The value of one item."""
+        """Return the value of one item."""
         return self.many([item])[0]
 
     def many(self, items: Sequence[int]) -> list[T]:
-        """The values of several items, in their order."""
+        """Return the values of several items, in their order."""
         missing = [item for item in dict.fromkeys(items) if item not in self.kept]
         for item, value in zip(missing, self.make(missing) if missing else [], strict=True):
             self.kept[item] = value, self.size(value)
@@ -107,7 +107,7 @@ class ItemCache(Generic[T]):
 
 
 class SceneDataset:
-    """Random access to the scenes and experts of a store. Pickles without what it keeps in memory.
+    """Random access to the scenes and experts of a store. It pickles without what it keeps in memory.
 
     Args:
         store: the run segments.
@@ -180,21 +180,21 @@ class SceneDataset:
 
     @property
     def open_traffic(self) -> bool:
-        """Whether agents enter and leave: here the same ones are there from the first step to the last."""
+        """Whether agents enter and leave: here they never do, as the same agents are present at every step."""
         return False
 
     @property
     def decisions(self) -> int:
-        """Actions until the last logged step of the longest segment, or up to the duration."""
+        """The number of actions until the last logged step of the longest segment, or up to the duration."""
         longest = int(self.store.num_steps[self.indices].max()) - 1
         return min(longest, round(self.duration / self.dt)) if self.duration else longest
 
     def checksum(self) -> str:
-        """The store's."""
+        """Return the checksum of the store."""
         return self.store.checksum()
 
     def segment(self, i: int) -> RunSegment:
-        """The run segment behind item ``i``, up to the duration."""
+        """Return the run segment behind item ``i``, up to the duration."""
         segment = self.store[self.indices[i]]
         if not self.duration:
             return segment
@@ -207,7 +207,7 @@ class SceneDataset:
         return segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})
 
     def graph(self, i: int) -> LaneGraph:
-        """The lane graph of item ``i``; segments on one map share it."""
+        """Return the lane graph of item ``i``; segments on one map share it."""
         return self._graph(int(self.store.map_index[self.indices[i]]))
 
     def _scene(self, i: int) -> SceneBatch:
@@ -218,12 +218,12 @@ class SceneDataset:
         return [self._scene(i) for i in items]
 
     def scenes(self, items: Sequence[int]) -> SceneBatch:
-        """Several items as one padded batch."""
+        """Return several items as one padded batch."""
         found: SceneBatch = self._batch(tuple(items))
         return found
 
     def fit(self, items: Sequence[int]) -> list[Experts]:
-        """The demonstrations of several items: those kept with the store, the others fitted together and kept."""
+        """Return the demonstrations of several items: those in the store, the others fitted together and kept."""
         contents = [self.store.content(self.indices[i]) for i in items]
         known = [self.kept.load(content) for content in contents]
         missing = [k for k, experts in enumerate(known) if experts is None]
@@ -235,7 +235,7 @@ class SceneDataset:
         return [experts for experts in known if experts is not None]
 
     def draw(self, count: int, rng: torch.Generator) -> list[int]:
-        """Different items at random (all, if there are fewer)."""
+        """Return different items at random (all, if there are fewer)."""
         return torch.randperm(len(self), generator=rng)[:count].tolist()
 
     def sample_states(
@@ -247,7 +247,7 @@ class SceneDataset:
         device: torch.device | str = "cpu",
         perturb: PerturbConfig | None = None,
     ) -> TensorDict:
-        """A training batch: expert states drawn from some segments, some of them displaced.
+        """Return a training batch: expert states drawn from some segments, some of them displaced.
 
         Returns:
             TensorDict [states], one agent per row: observation, ``valid`` and the expert's ``action``.
@@ -293,7 +293,7 @@ class SceneDataset:
         rng: torch.Generator,
         device: torch.device | str = "cpu",
     ) -> TensorDict:
-        """A training batch for the goal policy: experts at their first state, their routes and the one they took.
+        """Return a training batch for the goal policy: experts at their first state, and their routes.
 
         Returns:
             TensorDict [count], one agent per row: observation, ``valid``, ``ROUTES``, ``ROUTES_MASK``, ``GOAL``
@@ -324,7 +324,7 @@ class SceneDataset:
         return batch
 
     def fitted(self, items: Sequence[int], scenes: SceneBatch) -> Fitted:
-        """The motion of the interactive agents of some segments, as the fit to the action space has it."""
+        """Return the motion of the interactive agents of some segments, as fitted to the action space."""
         state, valid = logged(scenes)
         state, progress, known = (
             state.clone(),
@@ -347,7 +347,7 @@ class SceneDataset:
 
 
 class Fitted(NamedTuple):
-    """The motion of interactive agents; those that are no experts as logged, without actions."""
+    """The motion of interactive agents; those that are not experts move as logged, without actions."""
 
     state: Float[Tensor, "B T N 4"]
     valid: Bool[Tensor, "B T N"]  # where the log is
@@ -362,7 +362,7 @@ def transitions(
     observation: ObservationConfig | None = None,
     **how: Any,
 ) -> TensorDict:
-    """What the interactive agents of logged segments did, as the steps of a :class:`DrivingEnv`: for replay buffers.
+    """Return the driving of the interactive agents in logs as steps of a :class:`DrivingEnv`: for replay buffers.
 
     Args:
         data: the segments; agents follow the routes that they took, where it has routes.
@@ -399,7 +399,7 @@ def _seen_routes(
     progress: Float[Tensor, " M"],
     state: Float[Tensor, "M 4"],
 ) -> RouteWindow:
-    """The part that experts see of the routes they took, from states that may lie beside where they were."""
+    """Return the part that experts see of their routes, from states that may lie beside where they were."""
     taken = logged_routes([table for expert in experts for table in expert.routes], row)
     # Whoever is displaced along the route by up to some metres has come as far as where it is now.
     near = torch.full_like(progress, DISPLACED)[:, None]

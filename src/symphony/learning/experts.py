@@ -1,5 +1,5 @@
-"""Logged vehicles as demonstrations: the actions that lead through what they did, fitted many segments at a time and
-kept with their store; their states in the log, and what they would observe.
+"""Logged vehicles as demonstrations: the actions that reproduce their motion, fitted many segments at a time and kept
+with their store; their states in the log, and what they would observe.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Experts:
         actions: [K, T - 1] int16 or [K, T - 1, 2].
         valid: [K, T - 1] where the log is valid before and after the action.
         error: [K] metres between the last valid fitted and logged position.
-        progress: [K, T] metres that each has come along the route it took; [K, 0] where routes were not asked for.
+        progress: [K, T] metres that each has come along its route; [K, 0] where routes were not asked for.
         routes: feasible routes of each expert from its first valid state; empty where not asked for.
     """
 
@@ -70,7 +70,7 @@ class Experts:
 
     @property
     def nbytes(self) -> int:
-        """Bytes it takes in memory."""
+        """The bytes that it takes in memory."""
         tensors = (self.agent, self.states, self.actions, self.valid, self.error, self.progress)
         tables = (part for table in self.routes for part in (table.points, table.count, table.right))
         return sum(part.nbytes for part in (*tensors, *tables))
@@ -83,13 +83,13 @@ def fit_experts(
     *,
     routes: bool = False,
 ) -> list[Experts]:
-    """Fit every vehicle of some segments that moves or stands in a lane (waiting is driving, parking is not), and the
-    ego in any case, each independently of the others.
+    """Fit the ego and every other vehicle of some segments that moves or stands in a lane (waiting is driving,
+    parking is not), each independently of the others.
 
     Args:
         segments: the run segments.
         dynamics: the action space.
-        graphs: of their lanes, made here if not given.
+        graphs: of their lanes, built here if not given.
         routes: whether to find the experts' routes.
     """
     graphs = [LaneGraph(segment.road) for segment in segments] if graphs is None else graphs
@@ -126,7 +126,7 @@ def _demonstrators(segment: RunSegment, graph: LaneGraph) -> NDArray[np.int64]:
 def _fit(
     segments: Sequence[RunSegment], rows: Sequence[NDArray[np.int64]], dynamics: Bicycle | Displacement
 ) -> list[tuple[Tensor, Tensor]]:
-    """Actions [K, T - 1(, 2)], joint indices as int16, and states [K, T, 4] of the rows of each segment."""
+    """Return actions [K, T - 1(, 2)], joint indices as int16, and states [K, T, 4] of the rows of each segment."""
     found: dict[int, tuple[Tensor, Tensor]] = {}
     for dt in dict.fromkeys(segment.dt for segment in segments):
         group: list[int] = []
@@ -145,7 +145,7 @@ def _fit_together(
     group: Sequence[int],
     dynamics: Bicycle | Displacement,
 ) -> dict[int, tuple[Tensor, Tensor]]:
-    """Actions and states by segment, for a group of segments with one time step."""
+    """Return actions and states by segment, for a group of segments with one time step."""
     steps = max(segments[k].num_steps for k in group)
 
     def joined(name: str) -> Tensor:
@@ -169,7 +169,7 @@ def _fit_together(
 
 
 def logged_routes(tables: Sequence[RouteTable], row: Int[Tensor, " M"]) -> FollowedRoutes:
-    """The routes that experts took, one expert in each row [M, 1]."""
+    """Return the routes that experts took, one expert in each row [M, 1]."""
     none = np.zeros((0, 2), np.float32)
     lines = [table.line(table.logged) if table.logged >= 0 else none for table in tables]
     count = torch.tensor([len(line) for line in lines])
@@ -178,7 +178,7 @@ def logged_routes(tables: Sequence[RouteTable], row: Int[Tensor, " M"]) -> Follo
 
 
 def logged(scenes: SceneBatch) -> tuple[Float[Tensor, "B T N 4"], Bool[Tensor, "B T N"]]:
-    """The states of the interactive agents in the log, and where they are valid."""
+    """Return the states of the interactive agents in the log, and where they are valid."""
     steps = scenes.log_valid.shape[1]
     index = scenes.interactive[:, None].expand(-1, steps, -1)
     log = scenes.log_state.gather(2, index[..., None].expand(*index.shape, 5))
@@ -187,7 +187,7 @@ def logged(scenes: SceneBatch) -> tuple[Float[Tensor, "B T N 4"], Bool[Tensor, "
 
 
 def logged_heights(scenes: SceneBatch) -> Float[Tensor, "B T N 2"] | None:
-    """Height and level of the interactive agents in the log; None where no scene has levels."""
+    """Return height and level of the interactive agents in the log; None where no scene has levels."""
     if not scenes.agent_height.shape[1]:
         return None
     return scenes.agent_height.take_along_dim(scenes.interactive[:, None, :, None], 2)
@@ -204,8 +204,8 @@ def expert_batch(
     action: Tensor | None = None,
     routes: RouteWindow | None = None,
 ) -> TensorDict:
-    """Observations of agents [M] in given states [M, 4], everyone else as logged; beside them their actions and what
-    they see of their routes, where given.
+    """Return the observations of agents [M] in given states [M, 4] among all others as logged; with their actions and
+    what they see of their routes, where given.
     """
     index, here = agent[:, None], state[:, None]
     real = torch.ones_like(index, dtype=torch.bool)
@@ -222,10 +222,10 @@ def expert_batch(
 
 
 class KeptExperts:
-    """Demonstrations kept in a folder of their store, so that a segment is fitted once and not once a run.
+    """Demonstrations kept in a folder of their store, so that a segment is fitted once and not in every run.
 
     Files of arrays, nothing pickled, are named after all that they depend on. They are a cache: one that is missing
-    or damaged is made anew, and where the folder can't be written or belongs to the package, nothing is kept.
+    or damaged is made again, and where the folder can't be written or belongs to the package, nothing is kept.
 
     Args:
         store: the store's folder.
@@ -247,11 +247,11 @@ class KeptExperts:
 
     @property
     def writable(self) -> bool:
-        """Whether something can be kept."""
+        """Whether anything can be kept."""
         return self.folder is not None and os.access(self.folder, os.W_OK)
 
     def load(self, content: str) -> Experts | None:
-        """The demonstrations of the segment with this hash; None where there are none that can be read."""
+        """Return the demonstrations of the segment with this hash; None where there are none that can be read."""
         path = self._path(content)
         if path is None or not path.is_file():
             return None

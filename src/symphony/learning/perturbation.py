@@ -1,4 +1,4 @@
-"""Logged states displaced, with the action that leads smoothly back: what a log alone never shows.
+"""Displaced logged states, with the action that leads smoothly back: what a log alone never shows.
 
 A policy that has only seen the log does not know what to do beside it (the cause of behavioural cloning's drift). The
 labels are those of a critically damped return to the logged motion, along and across it.
@@ -25,7 +25,7 @@ STEERING, BRAKING = 0.5, 4.0
 
 
 def displaced(logged: Float[Tensor, "M 4"], rng: torch.Generator) -> Float[Tensor, "M 4"]:
-    """States x, y, heading, speed near logged ones.
+    """Return states x, y, heading, speed near logged ones.
 
     Errors are normal, times a number drawn uniformly from 0 to 1 for each state. Slow vehicles are moved less across
     and turned less, fast ones are turned less, so that no vehicle starts off sideways.
@@ -54,7 +54,7 @@ def way_back(
     length: Float[Tensor, " M"],
     dt: float,
 ) -> Float[Tensor, "M 4"]:
-    """The state a step later on a smooth return to the log.
+    """Return the state a step later on a smooth return to the log.
 
     Where ``state`` is the logged one, it keeps the log's acceleration and curvature.
 
@@ -90,8 +90,8 @@ def perturbed(
     share: float,
     rng: torch.Generator,
 ) -> tuple[Float[Tensor, "M 4"], Tensor]:
-    """Expert states and actions, a share of them displaced and labelled with the action that comes nearest to the way
-    back.
+    """Return expert states and actions, a share of them displaced and labelled with the action that comes nearest to
+    the way back.
 
     Args:
         state: x, y, heading, speed of the fitted experts.

@@ -1,4 +1,4 @@
-"""Demonstrations of a store made beforehand by worker processes, where training finds them."""
+"""Demonstrations of a store that worker processes make in advance, where training finds them."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def prepare(
     workers: int = 1,
     engine: Engine = "local",
 ) -> Iterator[tuple[int, int]]:
-    """Fit the vehicles of all run segments of a store, and keep that with the store. What is there already is left
-    as it is; the files are the same whatever the workers.
+    """Fit the vehicles of all run segments of a store, and keep the result with the store. Existing files are left as
+    they are; the files do not depend on the workers.
 
     Args:
         path: folder of the store.
@@ -65,7 +65,7 @@ def _opened(sent: bytes) -> SceneDataset:
 
 
 def _prepared(task: tuple[bytes, list[int]]) -> int:
-    """Prepare some run segments, of which nothing stays in memory."""
+    """Prepare some run segments, none of which stays in memory."""
     data, items = _opened(task[0]), task[1]
     data.fit(items)
     if not data.kept.writable:

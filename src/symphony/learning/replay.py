@@ -38,10 +38,10 @@ PRICE = 60.0
 
 
 class SearchReplay:
-    """The last search and what is drawn from it, until the next.
+    """The last search and the batches that are drawn from it until the next.
 
-    Where the collector has the rows of K searches, these are made as one, at every update that K x `every` divides,
-    by the networks as they are then, and updates learn from one after the other: with the k-th of them (from 0) from
+    Where the collector has the rows of K searches, these are made together, at every update that K x `every` divides,
+    by the networks of that update, and updates learn from one after the other: with the k-th of them (from 0) from
     states that are k x `every` to (k + 1) x `every` - 1 updates old. K = 1 learns from the same states as a search
     that is made when it is needed.
 
@@ -76,9 +76,7 @@ class SearchReplay:
         self._leaves: TensorDictBase | None = None
 
     def refresh(self, step: int) -> TensorDict:
-        """Search if it is due at an update, or was never done; what the last search found out about itself:
-        see :func:`search_statistics`.
-        """
+        """Search if a search is due at an update, or was never made; return its :func:`search_statistics`."""
         if self._found is None or step % self.period == 0:
             try:
                 self._found = self.collector.rollout()
@@ -95,13 +93,13 @@ class SearchReplay:
 
     @property
     def leaves(self) -> TensorDictBase:
-        """Leaves [B, S, T] of the last search, the tree in their entry ``tree``."""
+        """The leaves [B, S, T] of the last search, with the tree in their entry ``tree``."""
         if self._leaves is None:
             raise RuntimeError("nothing was searched yet")
         return self._leaves
 
     def survivors(self, count: int, rng: torch.Generator, observation: ObservationConfig) -> TensorDict:
-        """States of surviving rollouts and what was done in them, drawn uniformly from all before the scenes' ends.
+        """Return states of surviving rollouts and their actions, drawn uniformly from all before the scenes' ends.
 
         Args:
             count: K.
@@ -114,13 +112,13 @@ class SearchReplay:
         return self._learned(_drawn(self.env, self.leaves, count, rng), observation)
 
     def _learned(self, chosen: TensorDictBase, observation: ObservationConfig) -> TensorDict:
-        """Steps [K] as a policy observes them, with what was done."""
+        """Return steps [K] as a policy observes them, with their actions."""
         batch = DrivingEnv(self.env.scenes, self.env.dynamics, observation).at(chosen)
         batch.set(keys.ACTION, chosen.get(keys.ACTION))
         return batch.set(keys.ROLLOUT, torch.ones_like(batch.get(keys.VALID)))
 
     def blamed(self, count: int, rng: torch.Generator, observation: ObservationConfig) -> TensorDict:
-        """States of rollouts and what was done in them, drawn as often as it matters, with weights for a policy
+        """Return states of rollouts and their actions, drawn as often as they matter, with weights for a policy
         gradient: of a search that keeps all branches.
 
         Args:
@@ -139,9 +137,9 @@ class SearchReplay:
         return self._learned(self.leaves.flatten()[pick], observation).set(keys.WEIGHT, PRICE * weight)
 
     def both_kinds(self, rng: torch.Generator) -> TensorDict:
-        """Simulated states, pruned ones included, and logged states of the same scenes.
+        """Return simulated states, pruned ones included, and logged states of the same scenes.
 
-        The log is taken as fitted to the action space, so that it can't be told by its noise; its agents follow the
+        The log is taken as fitted to the action space, so that its noise does not give it away; its agents follow the
         routes they took.
 
         Args:
@@ -159,11 +157,11 @@ class SearchReplay:
 
     @property
     def searched(self) -> bool:
-        """Whether there was a search yet."""
+        """Whether there has been a search."""
         return self._leaves is not None
 
     def repeatable(self, count: int, rng: torch.Generator) -> TensorDictBase:
-        """First states [K] of survivors, with the random numbers that lead along their histories (``noise_plan``)."""
+        """Return first states [K] of survivors, with the random numbers of their histories (``noise_plan``)."""
         first = self.leaves[..., 0].flatten()
         pick = torch.randperm(len(first), generator=rng)[:count]
         return self.env.at(first[pick]).set(keys.NOISE_PLAN, self.leaves.get(keys.NOISE).flatten(0, 1)[pick])
@@ -192,7 +190,7 @@ class SearchReplay:
 
 
 def with_survivors(experts: TensorDict, rollouts: TensorDict) -> TensorDict:
-    """One batch [M, 1] of expert states [K, 1] and rollout states [L, N], told apart by ``ROLLOUT``."""
+    """Return one batch [M, 1] of expert states [K, 1] and rollout states [L, N], told apart by ``ROLLOUT``."""
     valid = experts.get(keys.VALID)
     experts.set(keys.ROLLOUT, torch.zeros_like(valid)).set(keys.WEIGHT, torch.ones_like(valid).float())
     present = [key for key in _LEARNED if key in experts.keys(True) and key in rollouts.keys(True)]
@@ -204,8 +202,8 @@ def with_survivors(experts: TensorDict, rollouts: TensorDict) -> TensorDict:
 
 
 def advantages(env: DrivingEnv, rollouts: TensorDictBase) -> Float[Tensor, "B S T N"]:
-    """How much better than in the other branches it went on after each action: less a first collision and time off
-    the road, discounted; 0 after the collision, and where nobody is. Raises a :class:`ConfigError` for one branch.
+    """Return how much better each action turned out than those of other branches: minus a first collision and time
+    off the road, discounted; 0 after the collision and for absent agents. One branch is a :class:`ConfigError`.
     """
     if rollouts.shape[1] < 2:
         raise ConfigError("search.branches must be at least 2: an action is compared with those of other branches")
@@ -221,8 +219,8 @@ def advantages(env: DrivingEnv, rollouts: TensorDictBase) -> Float[Tensor, "B S 
 
 
 def search_statistics(env: DrivingEnv, leaves: TensorDictBase) -> TensorDict:
-    """Numbers that matter to a search: whether scores rank colliding and off-road states last (AUC; NaN without any),
-    and the share of agent-steps that collide or are off the road before and after pruning.
+    """Return numbers that matter to a search: whether scores rank colliding and off-road states last (AUC; NaN
+    without any), and the share of agent-steps that collide or are off the road before and after pruning.
     """
     tree, record = leaves.get("tree"), {}
     going = leaves.get(keys.STEP) < env.scenes.last_step[leaves.get(keys.SCENE)]
@@ -244,7 +242,7 @@ def _after(steps: TensorDictBase) -> TensorDictBase:
 
 
 def _drawn(env: DrivingEnv, steps: TensorDictBase, count: int, rng: torch.Generator) -> TensorDictBase:
-    """Some [K] of the steps [*b] before their scenes' last, uniformly with replacement."""
+    """Return some [K] of the steps [*b] before their scenes' last, drawn uniformly with replacement."""
     counted = (steps.get(keys.STEP) < env.scenes.last_step[steps.get(keys.SCENE)]).squeeze(-1)
     rows = counted.nonzero()
     pick = rows[torch.randint(len(rows), (count,), generator=rng).to(rows.device)]

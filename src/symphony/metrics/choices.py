@@ -1,4 +1,4 @@
-"""What a search leaves of the goals that were drawn.
+"""The effect of a search on the goals that were drawn.
 
 Shapes: B segments, K rollouts, D draws (one per branch that was started), N interactive agents, G routes.
 """
@@ -24,7 +24,7 @@ SHORTEST = 0.01  # metres of a piece of a route that has a direction
 def route_turns(
     points: Float[Tensor, "*b K 2"], count: Int[Tensor, "*b"], turned: float = TURNED
 ) -> Int[Tensor, "*b"]:
-    """Which way routes first turn, as the place in :data:`TURNS`; straight on where they never do.
+    """Return which way routes first turn, as the place in :data:`TURNS`; straight on where they never do.
 
     Takes the points of each route, in metres, and how many of them exist.
     """
@@ -42,7 +42,7 @@ def route_turns(
 
 @dataclass(frozen=True)
 class Choice:
-    """What a search made of the goals of one segment."""
+    """The effect of a search on the goals of one segment."""
 
     #: [3] agents of all branches by the turn of the route they drew, see :data:`TURNS`
     drawn: NDArray[np.int64]
@@ -58,7 +58,7 @@ def choices(
     turn: Int[Tensor, "B N G"],
     founders: Float[Tensor, " B"],
 ) -> list[Choice]:
-    """What a search made of the goals of each segment.
+    """Return the effect of a search on the goals of each segment.
 
     Takes the numbers of the routes that the agents of all branches drew and that those of the rollouts follow, -1 for
     none; which way each route turns (:func:`route_turns`); and the first branches of each tree with descendants.
@@ -79,7 +79,7 @@ def choices(
 
 
 def choice_numbers(found: list[Choice]) -> dict[str, float]:
-    """What searches made of the goals of all segments together.
+    """Return the effect of searches on the goals of all segments together.
 
     Returns:
         ``goals_drawn_left`` (and ``straight``, ``right``), percent of the agents of all branches; ``goals_kept_left``

@@ -12,17 +12,17 @@ _TINY = 1e-300
 
 
 def summed(values: NDArray[Any], member: NDArray[np.int64]) -> NDArray[Any]:
-    """Sums of values [segments, ...] over the segments of each group, by the number of the group of each."""
+    """Return the sums of values [segments, ...] over the segments of each group, given each segment's group."""
     out = np.zeros((int(member.max(initial=-1)) + 1, *values.shape[1:]), values.dtype)
     np.add.at(out, member, values)
     return out
 
 
 def ratio(total: NDArray[np.float64], weight: NDArray[np.float64], member: NDArray[np.int64]) -> tuple[float, float]:
-    """Ratio of sums and its standard error over groups (linearised; NaN for a single one).
+    """Return a ratio of sums and its standard error over groups (linearised; NaN for a single one).
 
     Takes what each segment adds to numerator and denominator, and the number of its group. Groups without anything to
-    count are no samples: of two recordings of which one is empty there is no error.
+    count are not samples: of two recordings of which one is empty there is no error.
     """
     if weight.sum() == 0:
         return math.nan, math.nan
@@ -40,13 +40,13 @@ def ratio(total: NDArray[np.float64], weight: NDArray[np.float64], member: NDArr
 def grouped_mean(
     value: NDArray[np.float64], weight: NDArray[np.float64], member: NDArray[np.int64]
 ) -> tuple[float | None, float | None]:
-    """Weighted mean and its standard error over groups (see :func:`ratio`); None for NaN."""
+    """Return a weighted mean and its standard error over groups (see :func:`ratio`); None for NaN."""
     mean, error = ratio(value * weight, weight, member)
     return None if math.isnan(mean) else mean, None if math.isnan(error) else error
 
 
 def clustered_mean(values: NDArray[np.float64], member: NDArray[np.int64]) -> tuple[float, float]:
-    """Mean of the finite ones of some values and its standard error, where those of one group (its number in
+    """Return the mean of the finite values and its standard error, where those of one group (its number in
     ``member``) are not independent.
     """
     known = np.isfinite(values)
@@ -54,7 +54,7 @@ def clustered_mean(values: NDArray[np.float64], member: NDArray[np.int64]) -> tu
 
 
 def zero_bound(of: int) -> float:
-    """Percent, about 300 / n, that a rate has at most, with 95 % confidence, of which n samples show nothing.
+    """Return the percent, about 300 / n, that a rate has at most, with 95 % confidence, if n samples show nothing.
 
     Source: Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26 (1934).
     """
@@ -62,7 +62,7 @@ def zero_bound(of: int) -> float:
 
 
 def t_quantile(probability: float, freedom: int) -> float:
-    """Quantile of Student's t: of a mean of n samples, in standard errors, with n - 1 degrees of freedom."""
+    """Return the quantile of Student's t: of a mean of n samples, in standard errors, with n - 1 degrees."""
     if probability == 0.5:
         return 0.0
     tail = 2 * min(probability, 1 - probability)
@@ -73,7 +73,7 @@ def t_quantile(probability: float, freedom: int) -> float:
 
 
 def beta_quantile(probability: float, a: float, b: float) -> float:
-    """Quantile of the beta distribution, by halving until nothing is left between two numbers."""
+    """Return the quantile of the beta distribution, by halving until nothing is left between two numbers."""
     low, high = 0.0, 1.0
     while True:
         middle = 0.5 * (low + high) if low > 0 else high / 1024 if high > _TINY else 0.0
@@ -83,7 +83,7 @@ def beta_quantile(probability: float, a: float, b: float) -> float:
 
 
 def _beta(x: float, a: float, b: float) -> float:
-    """Regularised incomplete beta function I_x(a, b), by its continued fraction (DLMF 8.17.22)."""
+    """Return the regularised incomplete beta function I_x(a, b), by its continued fraction (DLMF 8.17.22)."""
     if x > (a + 1) / (a + b + 2):
         return 1.0 - _beta(1.0 - x, b, a)
     front = a * math.log(x) + b * math.log1p(-x) + math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b)

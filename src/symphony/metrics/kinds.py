@@ -1,4 +1,4 @@
-"""What kind of collision: who ran into whom, and from where.
+"""The kinds of collisions: who ran into whom, and from where.
 
 A rate alone does not tell a policy that brakes too late from one that is hit by playback vehicles, which can't react.
 
@@ -56,10 +56,10 @@ class CollisionKinds(NamedTuple):
     playback: Bool[Tensor, "*lead N"]  # bool, whether that one is no interactive agent
 
     def first(self) -> tuple[Int[Tensor, "*lead"], Bool[Tensor, "*lead"]]:
-        """Kind (-1 for none) and `playback` of the first collision of each rollout.
+        """Return the kind (-1 for none) and `playback` of the first collision of each rollout.
 
         Of collisions at the same step, as when two interactive agents meet, the first of :class:`CollisionKind`
-        counts, being rear-ended last: the one who ran into the other, not the one who was hit.
+        counts, being rear-ended last: the agent that ran into the other, not the one that was hit.
         """
         number = len(CollisionKind)
         none = torch.iinfo(torch.int64).max
@@ -84,7 +84,7 @@ def collision_kinds(
     agent_type: Int[Tensor, "*#lead A"],
     height: tuple[Float[Tensor, "*#lead N T+1 2"], Float[Tensor, "*#lead A T+1 2"]] | None = None,
 ) -> CollisionKinds:
-    """With whom, when and how each interactive agent collides first. Leading dimensions broadcast.
+    """Return with whom, when and how each interactive agent collides first. Leading dimensions broadcast.
 
     The other one is the valid agent whose box meets the agent's first within that step; of several at once the one
     that reaches deepest into it at its end. The states one step before and those at the time of contact decide the
@@ -111,7 +111,7 @@ def collision_kinds(
     agent = rows.gather(-1, who[:, None])[:, 0]
 
     def everyone(driven: Tensor, logged: Tensor, rank: int) -> tuple[Tensor, Tensor]:
-        """Of each collision the values [M, A, ...] of all agents before and after its step."""
+        """Return for each collision the values [M, A, ...] of all agents before and after its step."""
         driven, logged = (expanded(value, rank).movedim(-rank + 1, -rank) for value in (driven, logged))
         before, after = (_placed(logged[at], driven[at], rows) for at in ((*where, step), (*where, step + 1)))
         return before, after
@@ -140,7 +140,7 @@ def collision_kinds(
 def _placed(
     values: Shaped[Tensor, "M A *e"], driven: Shaped[Tensor, "M N *e"], rows: Int[Tensor, "M N"]
 ) -> Shaped[Tensor, "M A *e"]:
-    """Values [M, A, ...] with those of the interactive agents [M, N, ...] in their rows."""
+    """Return values [M, A, ...] with those of the interactive agents [M, N, ...] in their rows."""
     count = values.shape[1]
     # Padding goes to a row more, which is dropped.
     values = torch.cat([values, torch.zeros_like(values[:, :1])], 1)
@@ -156,7 +156,7 @@ def _first_met(
     agent: Int[Tensor, " M"],
     height: tuple[Float[Tensor, "M A 2"], Float[Tensor, "M A 2"]] | None,
 ) -> tuple[Int[Tensor, " M"], Float[Tensor, " M"], Float[Tensor, "M A 5"], Float[Tensor, "M A 5"]]:
-    """Whom each agent [M] meets first in a step, after which share of it, and the poses of everyone before and after.
+    """Return whom each agent [M] meets first in a step, after which share of it, and all poses before and after.
 
     Where the agent and the other were not both there before the step, the poses before it are those after it. Poses,
     validity and heights are given before and after the step.
@@ -203,7 +203,7 @@ def kind_of_contact(
     size_one: Float[Tensor, "M 2"],
     size_two: Float[Tensor, "M 2"],
 ) -> Int[Tensor, " M"]:
-    """:class:`CollisionKind` [M] of contacts, whoever the other is, from the point of view of the first agent.
+    """Return the :class:`CollisionKind` [M] of contacts from the point of view of the first agent.
 
     Takes the poses of both before and after the step, the share of it after which they first overlap, and their
     boxes.
@@ -228,7 +228,7 @@ def kind_of_contact(
 def _at_contact(
     before: Float[Tensor, "M 5"], after: Float[Tensor, "M 5"], share: Float[Tensor, " M"]
 ) -> Float[Tensor, "M 3"]:
-    """Position and heading between two states."""
+    """Return position and heading between two states."""
     ends = torch.stack([before, after], 1)
     position, heading = pose_at(ends[..., :2], ends[..., 2], share.to(ends.dtype))
     return torch.cat([position, heading[:, None]], -1)
@@ -240,7 +240,7 @@ def _separations(
     size_one: Float[Tensor, "M 2"],
     size_two: Float[Tensor, "M 2"],
 ) -> tuple[Float[Tensor, " M"], ...]:
-    """How far two is ahead of one, and the gaps between their boxes along and across their mean heading."""
+    """Return how far two is ahead of one, and the gaps between their boxes along and across their mean heading."""
     half = 0.5 * wrap(two[:, 2] - one[:, 2])
     # The mean heading, not that of either: so the two agents always agree on what they did.
     delta = rotate(two[:, :2] - one[:, :2], -(one[:, 2] + half))
@@ -252,5 +252,5 @@ def _separations(
 
 
 def _closing(gap: Float[Tensor, " M"], gap_hit: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
-    """Share of the step after which a gap is closed; where it was closed before, minus its depth."""
+    """Return the share of the step after which a gap is closed; where it was closed before, minus its depth."""
     return torch.where(gap > 0, gap / (gap - gap_hit).clamp(min=1e-6), gap)

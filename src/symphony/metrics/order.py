@@ -23,7 +23,7 @@ def passing_gap(
     dt: float,
     reach: float = REACH,
 ) -> Float[Tensor, "*batch"]:
-    """Seconds by which the first of two agents is ahead of the second where their paths first meet.
+    """Return the seconds by which the first of two agents is ahead of the second where their paths first meet.
 
     Negative where the second passes first; NaN where the paths don't come within ``reach`` of each other. Of all
     pairs of times at which the two are that close, the earliest counts, by the sum of the two.
@@ -47,7 +47,7 @@ def passing_gap(
 def _finer(
     path: Float[Tensor, "*b T F"], valid: Bool[Tensor, "*b T"]
 ) -> tuple[Float[Tensor, "*b fine F"], Bool[Tensor, "*b fine"]]:
-    """The path at parts of a step, straight in between, and where both neighbours are valid."""
+    """Return the path at parts of a step, straight in between, and where both neighbours are valid."""
     steps = path.shape[-2]
     where = torch.arange((steps - 1) * _FINER + 1, device=path.device)
     before = torch.div(where, _FINER, rounding_mode="floor")

@@ -1,4 +1,4 @@
-"""Who collides, between states or at them (paper, section V).
+"""Collisions between states or at them (paper, section V).
 
 Metres and radians. Legend: A agents, N interactive agents, U states, T steps, R worlds, E meetings.
 """
@@ -39,12 +39,12 @@ def meetings(
     *,
     at_states: bool = False,
 ) -> Meetings:
-    """Whose boxes overlap at some time of each step, or at each state, of all subjects and all other agents.
+    """Return which boxes of subjects and other agents overlap at some time of each step, or at each state.
 
-    Between two states centres move straight and headings turn evenly; who was not there at the first of them is
-    looked at where it is at the second. Boxes that only touch do not overlap.
+    Between two states centres move straight and headings turn evenly; an agent that was not there at the first is
+    taken where it is at the second. Boxes that only touch do not overlap.
 
-    Takes box centres, headings, length and width, and what is valid: an agent that is not meets nobody, whatever its
+    Takes box centres, headings, length and width, and what is valid: an invalid agent meets nobody, whatever its
     other numbers are. A negative row of A among the subjects stands for no agent. Agents on two levels both before
     and after a step, by their height and level, do not meet (:func:`symphony.geometry.levels_apart`).
     """
@@ -103,8 +103,8 @@ def collisions(
     *,
     at_states: bool = False,
 ) -> Bool[Tensor, "*lead N T"]:
-    """Whether the oriented box of each subject overlaps any other agent's in each of the U - 1 steps between states,
-    or with ``at_states`` at each of the U states (as the paper and WOSAC count), see :func:`meetings`, which
+    """Return whether the oriented box of each subject overlaps any other agent's in each of the U - 1 steps between
+    states, or with ``at_states`` at each of the U states (as the paper and WOSAC count), see :func:`meetings`, which
     takes the same. Leading dimensions broadcast.
     """
     lead = torch.broadcast_shapes(

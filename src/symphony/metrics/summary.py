@@ -25,14 +25,14 @@ BINS = 201  # bins of width 0.01 1/m, centred at the multiples of 0.01 in [-1, 1
 
 
 def curvature_histogram(curvature: NDArray[Any]) -> NDArray[np.int64]:
-    """Counts [201] of average curvatures [...] in 1/m; values beyond +-1 fall into the outermost bins."""
+    """Return the counts [201] of average curvatures [...] in 1/m; values beyond +-1 fall into the outermost bins."""
     half = BINS // 2
     flat = np.asarray(curvature, dtype=np.float64).reshape(-1).clip(-1, 1)
     return np.bincount(np.rint(flat * half).astype(np.int64) + half, minlength=BINS)
 
 
 def jensen_shannon(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.float64]:
-    """Jensen-Shannon divergence [...] of histograms [..., K], in nats (0 to ln 2); NaN where either is empty.
+    """Return the Jensen-Shannon divergence [...] of histograms [..., K], in nats (0 to ln 2); NaN if one is empty.
 
     It is the divergence itself, not its square root.
     """
@@ -45,7 +45,7 @@ def jensen_shannon(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.floa
 
 
 class Divergence(NamedTuple):
-    """A divergence between what rollouts and logs chose, and what is left of it without sampling."""
+    """A divergence between the choices of rollouts and logs, with and without the bias of sampling."""
 
     value: float  # of the summed histograms, nats
     error: float  # standard error (jackknife); NaN for a single sample
@@ -54,7 +54,7 @@ class Divergence(NamedTuple):
 
 
 def sampled_divergence(counts: NDArray[Any], counts_log: NDArray[Any]) -> Divergence:
-    """Jensen-Shannon divergence of the sums of n independent samples, its error and bias by leaving one out.
+    """Return the Jensen-Shannon divergence of sums of n independent samples, its error and bias by leaving one out.
 
     Samples are drawn as pairs: of segments that are alike in rollouts and log less is sampling than of others, and
     rollouts that are alike count as what they are.
@@ -73,7 +73,7 @@ def sampled_divergence(counts: NDArray[Any], counts_log: NDArray[Any]) -> Diverg
 
 
 def sampling_floor(counts_log: NDArray[Any]) -> float:
-    """What a log of this size scores against the distribution that it is a sample of, nats.
+    """Return the score in nats of a log of this size against the distribution that it is a sample of.
 
     No policy is known to be better, however many rollouts it has. It is estimated by bootstrap samples of the
     segments, of which it takes the log's histograms [n, K], against all of them. Two logs of this size differ by
@@ -88,7 +88,7 @@ def sampling_floor(counts_log: NDArray[Any]) -> float:
 
 
 def _relative(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sum of p ln(p / q) over the bins where p is not 0; NaN stays NaN."""
+    """Return the sum of p ln(p / q) over the bins where p is not 0; NaN stays NaN."""
     none = p == 0
     return (p * np.log(np.where(none, 1.0, p) / np.where(none, 1.0, q))).sum(-1)
 
@@ -117,7 +117,7 @@ _ROW = (
 
 @dataclass(frozen=True)
 class SegmentResult:
-    """What one run segment adds to the table."""
+    """The contribution of one run segment to the table."""
 
     group: str  # the recording it is part of
     rollouts: int  # K
@@ -161,7 +161,7 @@ class RolloutMetrics:
     ) -> None:
         """Add the rollouts of some segments, each seen once in all updates, else a ValueError is raised.
 
-        Segments of one recording (``groups``, see ``RunSegment.group``) are no independent samples: standard errors
+        Segments of one recording (``groups``, see ``RunSegment.group``) are not independent samples: standard errors
         are over groups. Only agent-steps that exist (``simulated``) count, and where the log is valid (``logged``)
         distances from it, ``displacement`` in metres. Flags say whether an agent's box overlaps another at the state
         after a step, and whether its centre is off the road, which nobody is where the map has no boundary
@@ -224,7 +224,7 @@ class RolloutMetrics:
         self.segments.update(other.segments)
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per segment, ordered by its id, for paired comparisons; ``group`` is the recording it is part of.
+        """Return a row per segment, ordered by id, for paired comparisons; ``group`` is the recording it is part of.
 
         Percentages (see :meth:`compute`), ``ade`` and ``min_sade`` in metres, and ``goals_variation`` where a search
         had goals; NaN for a mean over nothing.
@@ -238,7 +238,7 @@ class RolloutMetrics:
         return found
 
     def mean(self, values: Mapping[str, float]) -> tuple[float, float]:
-        """Mean of another number of every segment, and its standard error over the same groups; NaN is left out."""
+        """Return the mean of a further number of every segment and its standard error over groups, without NaN."""
         known = {name: value for name, value in sorted(values.items()) if not math.isnan(value)}
         if any(map(math.isinf, known.values())):
             return sum(known.values()), math.nan
@@ -246,7 +246,7 @@ class RolloutMetrics:
         return ratio(np.array(list(known.values())), np.ones(len(known)), member)
 
     def curvature_histograms(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Counts [201] of the branching regions visited by their average curvature: rollouts, and logs."""
+        """Return counts [201] of the branching regions visited by their average curvature: rollouts, and logs."""
         visited, visited_log = np.zeros((2, BINS), np.int64)
         for segment in self.segments.values():
             visited += segment.histogram
@@ -254,14 +254,14 @@ class RolloutMetrics:
         return visited, visited_log
 
     def curvature_divergence(self) -> tuple[Divergence, list[str]]:
-        """The divergence, and the names of its samples: the groups."""
+        """Return the divergence, and the names of its samples: the groups."""
         found = [self.segments[name] for name in sorted(self.segments)]
         names, member = np.unique([one.group for one in found], return_inverse=True)
         counts = (np.stack(each) for each in zip(*((s.histogram, s.histogram_log) for s in found), strict=True))
         return sampled_divergence(*(summed(each, member) for each in counts)), names.tolist()
 
     def compute(self) -> dict[str, Any]:
-        """The table row.
+        """Return the table row.
 
         Returns:
             Percentages, distances in metres, each with its standard error over groups under ``*_se`` (linearised for
@@ -315,13 +315,13 @@ class RolloutMetrics:
 
 
 def _nearest(error: NDArray[np.float64], count: NDArray[np.float64]) -> tuple[float, float]:
-    """Error and agent-steps of the rollout that is nearest to the log on average; 0 where none is compared."""
+    """Return the error and agent-steps of the rollout nearest to the log on average; 0 where none is compared."""
     best = int(np.where(count > 0, error / np.maximum(count, 1), np.inf).argmin())
     return float(error[best]), float(count[best])
 
 
 def _by_kind(kind: NDArray[np.int64], playback: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """How many collisions there are by kind and whether the other is a playback agent [kinds, 2]."""
+    """Return the number of collisions by kind and whether the other is a playback agent [kinds, 2]."""
     same = kind[..., None] == np.array(CollisionKind)
     other = playback[..., None] == np.array([False, True])
     return (same[..., None] & other[..., None, :]).sum(tuple(range(kind.ndim)))

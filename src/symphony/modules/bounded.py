@@ -41,17 +41,17 @@ def inverse_cdf(logits: Float[Tensor, "*b C"], noise: Reals) -> Int[Tensor, "*b"
 
 
 def squash(x: Reals) -> Reals:
-    """`x / sqrt(1 + x^2)`, in (-1, 1)."""
+    """Return `x / sqrt(1 + x^2)`, in (-1, 1)."""
     return x / (1.0 + x.square()).sqrt()
 
 
 def positive(x: Reals, smooth: float = SMOOTH) -> Reals:
-    """A smooth `max(x, 0)`: `(x + sqrt(x^2 + smooth^2)) / 2`, above it by at most `smooth / 2`."""
+    """Return a smooth `max(x, 0)`: `(x + sqrt(x^2 + smooth^2)) / 2`, above it by at most `smooth / 2`."""
     return 0.5 * (x + (x.square() + smooth**2).sqrt())
 
 
 def displaced(share: Pairs, pace: Reals, slope: Reals, reach: float) -> Pairs:
-    """Displacements [..., 2] (metres; forward, left) by shares [..., 2] in (-1, 1) of what can be reached.
+    """Return displacements [..., 2] (metres; forward, left) for shares [..., 2] in (-1, 1) of what can be reached.
 
     forward = positive(pace + reach share1), so the speed changes by at most reach / dt and never becomes negative;
     left = forward * slope * share2, so nothing slides sideways or turns at standstill.
@@ -61,8 +61,8 @@ def displaced(share: Pairs, pace: Reals, slope: Reals, reach: float) -> Pairs:
 
 
 def shares(displacement: Pairs, pace: Reals, slope: Reals, reach: float, least: float = 1e-4) -> Pairs:
-    """Inverse of :func:`displaced`; what can't be reached has shares beyond 1. Less than `least` metres forward count
-    as so many.
+    """Invert :func:`displaced`; what can't be reached has shares beyond 1. Less than `least` metres forward count as
+    `least`.
     """
     forward = displacement[..., 0].clamp_min(least)
     first = (forward - SMOOTH**2 / (4.0 * forward) - pace) / reach
@@ -70,7 +70,7 @@ def shares(displacement: Pairs, pace: Reals, slope: Reals, reach: float, least: 
 
 
 def log_area(share: Pairs, pace: Reals, slope: Reals, reach: float) -> Reals:
-    """Logarithm [...] of the square metres of displacements per area of shares."""
+    """Return the logarithm [...] of the square metres of displacements per area of shares."""
     x = pace + reach * share[..., 0]
     bend = 0.5 * (1.0 + x / (x.square() + SMOOTH**2).sqrt())
     return (reach * bend * positive(x) * slope).log()
@@ -104,7 +104,7 @@ class BoundedDisplacement(Distribution):
     def expand(
         self, batch_shape: torch.Size | Sequence[int], _instance: Distribution | None = None
     ) -> BoundedDisplacement:
-        """The same distribution for a larger batch."""
+        """Return the same distribution expanded to a larger batch."""
         shape = torch.Size(batch_shape)
         return BoundedDisplacement(
             self.loc.expand(*shape, 2),
@@ -116,11 +116,11 @@ class BoundedDisplacement(Distribution):
         )
 
     def displacement(self, u: Pairs) -> Pairs:
-        """The displacement that Gaussian numbers [..., 2] stand for."""
+        """Return the displacement that Gaussian numbers [..., 2] stand for."""
         return displaced(squash(u), self.pace, self.slope, self.reach)
 
     def latent(self, displacement: Pairs) -> Pairs:
-        """Inverse of :meth:`displacement`; what lies outside the bounds or next to them is moved to INSIDE them."""
+        """Invert :meth:`displacement`; what lies outside the bounds or next to them is moved to INSIDE them."""
         share = shares(displacement, self.pace, self.slope, self.reach)
         share = share.clamp(-INSIDE, INSIDE)
         return share / (1.0 - share.square()).sqrt()
@@ -129,13 +129,13 @@ class BoundedDisplacement(Distribution):
         self,
         sample_shape: torch.Size | Sequence[int] = torch.Size(),  # noqa: B008
     ) -> Pairs:
-        """Draw, with gradient to the parameters."""
+        """Return a draw with gradient to the parameters."""
         shape = self._extended_shape(torch.Size(sample_shape))
         noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
         return self.displacement(self.loc + self.scale * noise)
 
     def icdf(self, value: Pairs) -> Pairs:
-        """The draw that independent uniform numbers [..., 2] in (0, 1) stand for, with gradient to the parameters."""
+        """Return the draw of independent uniform numbers [..., 2] in (0, 1), with gradient to the parameters."""
         return self.displacement(self.loc + self.scale * torch.special.ndtri(value))
 
     @property
@@ -145,11 +145,11 @@ class BoundedDisplacement(Distribution):
 
     @property
     def deterministic_sample(self) -> Pairs:
-        """What TorchRL takes when it does not explore."""
+        """The sample that TorchRL takes without exploration."""
         return self.mode
 
     def log_prob(self, value: Pairs) -> Reals:
-        """Log-density [...]; that of the nearest displacement INSIDE the bounds where `value` is not: no entropy."""
+        """Return the log-density [...]; that of the nearest displacement INSIDE the bounds for others: no entropy."""
         u = self.latent(value)
         # Both squashings have the derivative (1 + u^2)^(-3/2).
         volume = log_area(squash(u), self.pace, self.slope, self.reach)
@@ -159,7 +159,7 @@ class BoundedDisplacement(Distribution):
 
 @cache
 def _edges(cells: int) -> tuple[float, ...]:
-    """Shares at which one of so many cells ends and the next begins, from -1 to 1, dense in the middle."""
+    """Return the shares at which one of ``cells`` ends and the next begins, from -1 to 1, dense in the middle."""
     unit = [2.0 * i / cells - 1.0 for i in range(cells + 1)]
     return tuple(x * (0.2 + 0.8 * abs(x)) for x in unit)
 
@@ -193,7 +193,7 @@ class DisplacementHistogram(Distribution):
     def expand(
         self, batch_shape: torch.Size | Sequence[int], _instance: Distribution | None = None
     ) -> DisplacementHistogram:
-        """The same distribution for a larger batch."""
+        """Return the same distribution expanded to a larger batch."""
         shape = torch.Size(batch_shape)
         return DisplacementHistogram(
             self.logits.expand(*shape, self.logits.shape[-1]),
@@ -212,13 +212,13 @@ class DisplacementHistogram(Distribution):
 
     @property
     def mean_share(self) -> Pairs:
-        """Mean [..., 2] of the shares drawn, with gradient to the logits."""
+        """Return mean [..., 2] of the shares drawn, with gradient to the logits."""
         probability = self.logits.softmax(-1).unflatten(-1, self.cells)
         middle = [(edges[1:] + edges[:-1]) / 2 for edges in self.edges]
         return torch.stack([(probability.sum(-1 - k) * middle[k]).sum(-1) for k in range(2)], -1)
 
     def within(self, cell: Int[Tensor, "*b"], place: Pairs) -> Pairs:
-        """Shares [..., 2] at places [..., 2] in (0, 1) of cells by number."""
+        """Return shares [..., 2] at places [..., 2] in (0, 1) of cells by number."""
         # Cells of one acceleration lie side by side.
         number = torch.stack([cell // self.cells[1], cell % self.cells[1]], -1)
         low, high = (
@@ -227,7 +227,7 @@ class DisplacementHistogram(Distribution):
         return low + (high - low) * place
 
     def icdf(self, value: Pairs) -> Pairs:
-        """The draw that independent uniform numbers [..., 2] in (0, 1) stand for.
+        """Return the draw that independent uniform numbers [..., 2] in (0, 1) stand for.
 
         The first decides the cell and, by where it lies in that cell's share of (0, 1), the place along it; the
         second the place across it.
@@ -249,7 +249,7 @@ class DisplacementHistogram(Distribution):
         self,
         sample_shape: torch.Size | Sequence[int] = torch.Size(),  # noqa: B008
     ) -> Pairs:
-        """Draw, with gradient to the logits and the bounds."""
+        """Return a draw with gradient to the logits and the bounds."""
         shape = self._extended_shape(torch.Size(sample_shape))
         return self.icdf(torch.rand(shape, dtype=self.logits.dtype, device=self.logits.device))
 
@@ -261,11 +261,11 @@ class DisplacementHistogram(Distribution):
 
     @property
     def deterministic_sample(self) -> Pairs:
-        """What TorchRL takes when it does not explore."""
+        """The sample that TorchRL takes without exploration."""
         return self.mode
 
     def log_prob(self, value: Pairs) -> Reals:
-        """Log-density [...]; that of the nearest displacement that can be reached where `value` is not one."""
+        """Return the log-density [...], that of the nearest displacement in reach where `value` is not in reach."""
         share = shares(value, self.pace, self.slope, self.reach, LEAST).clamp(-1.0, 1.0)
         area = log_area(share, self.pace, self.slope, self.reach)
         cell = torch.zeros_like(share[..., 0], dtype=torch.int64)

@@ -1,4 +1,4 @@
-"""From what an agent observes to one vector: its own features and pooled sets of elements around it."""
+"""Encoding of an observation as one vector: the agent's own features and pooled sets of elements around it."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def mlp(sizes: Sequence[int]) -> nn.Sequential:
 
 
 def gap_features(gap: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3"]:
-    """Signed gaps in metres as numbers of order one: fine near contact, coarse farther away."""
+    """Return signed gaps in metres as numbers of order one: fine near contact, coarse farther away."""
     return torch.stack([(gap / 0.5).tanh(), (gap / 3.0).tanh(), (gap / 10.0).tanh()], -1)
 
 
 def road_features(distance: Float[Tensor, "*b points"]) -> Float[Tensor, "*b features"]:
-    """Signed distances to the edge of the road in metres as numbers of order one, two for each."""
+    """Return signed distances to the edge of the road in metres as numbers of order one, two for each."""
     return torch.cat([(distance / 0.5).tanh(), (distance / 3.0).tanh()], -1)
 
 
@@ -77,7 +77,7 @@ class SceneEncoder(nn.Module):
     def forward(
         self, own: Float[Tensor, "*b n own"], valid: Bool[Tensor, "*b n"], *elements_and_masks: Tensor
     ) -> Float[Tensor, "*b n width"]:
-        """Own features, mask, then elements `[..., N, K, F]` and mask `[..., N, K]` of each group."""
+        """Encode own features under a mask, then elements `[..., N, K, F]` and mask `[..., N, K]` of each group."""
         if len(elements_and_masks) != 2 * len(self.groups):
             raise ValueError(
                 f"expected elements and mask of {len(self.groups)} groups, got {len(elements_and_masks)} tensors"
@@ -107,7 +107,7 @@ class SceneNetwork(nn.Module):
     def forward(
         self, own: Float[Tensor, "*b n own"], valid: Bool[Tensor, "*b n"], *elements_and_masks: Tensor
     ) -> Float[Tensor, "*b n outputs"]:
-        """Inputs as for :class:`SceneEncoder`."""
+        """Compute the outputs; inputs are as for :class:`SceneEncoder`."""
         return self.head(self.encoder(own, valid, *elements_and_masks))
 
 

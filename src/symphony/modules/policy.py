@@ -1,4 +1,4 @@
-"""Policies over actions and goals, random numbers as a function of what they are for, and draws decided by them."""
+"""Policies over actions and goals, random numbers keyed by their use, and draws decided by such numbers."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class RouteScores(nn.Module):
     def forward(
         self, own: Float[Tensor, "*b N F"], valid: Bool[Tensor, "*b N"], *inputs: Shaped[Tensor, "*_"]
     ) -> Float[Tensor, "*b N G"]:
-        """Inputs as for :class:`SceneEncoder`, then routes `[..., N, G, F]` and their mask `[..., N, G]`."""
+        """Compute logits from the inputs of :class:`SceneEncoder`, routes `[..., N, G, F]` and mask `[..., N, G]`."""
         *elements, routes, mask = inputs
         around = self.scene(self.encoder(own, valid, *elements))
         if not on_host(mask):
@@ -74,7 +74,7 @@ def goal_policy(
     valid_key: NestedKey = keys.VALID,
     encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
-    """A categorical over each agent's feasible routes, given the first state: h(g | s_1).
+    """Build a categorical over each agent's feasible routes, given the first state: h(g | s_1).
 
     Writes logits `[..., N, G]` and goals `[..., N]` int64 (meaningless for agents without a route: see
     :func:`drawn_goals`). A uniform number under `GOAL_NOISE`, if there is one, decides the draw. Another `encoder`
@@ -96,7 +96,7 @@ def goal_policy(
 
 
 def drawn_goals(goal: Int[Tensor, "*b N"], mask: Bool[Tensor, "*b N G"]) -> Int[Tensor, "*b N"]:
-    """Goals `[..., N]` with -1 for agents that have no route in `mask` `[..., N, G]`."""
+    """Return goals `[..., N]` with -1 for agents that have no route in `mask` `[..., N, G]`."""
     return torch.where(mask.any(-1), goal, -1)
 
 
@@ -108,7 +108,7 @@ AXLE = 0.3  # distance from box centre to rear axle, as a share of the length
 
 
 class _Parameters(nn.Module):
-    """From the head's numbers, states [..., N, 4], own features and mask to the parameters.
+    """Maps the head's numbers, states [..., N, 4], own features and mask to the parameters.
 
     The numbers are the logits of cells [..., N, C], or the mean and the raw width of a Gaussian [..., N, 4].
     Padded agents, whose states may be anything, count as standing.
@@ -152,16 +152,16 @@ def displacement_policy(
     noise_key: NestedKey = keys.NOISE,
     encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
-    """Encoder, head and a :class:`BoundedDisplacement` (the action space the paper gives to MGAIL, section V-A), or a
-    :class:`DisplacementHistogram` in its place.
+    """Build an encoder, a head and a :class:`BoundedDisplacement` (the action space the paper gives to MGAIL, section
+    V-A), or a :class:`DisplacementHistogram` in its place.
 
     Weights follow `torch.manual_seed`. Writes actions `[..., N, 2]` in metres, sampled with gradient
     (reparameterised) according to TorchRL's exploration type; a pair of uniform numbers under `noise_key` decides
     them where there is one (see :class:`NoiseSampler`).
 
     `own_features` counts those under all `own_keys`; the second of the first key is the box length, of which
-    `size_scale` metres count as 1. There are so many `cells` along and across, 0 for a Gaussian; `dt` are seconds per
-    step. Of `state_key` `[..., N, 4]` the speed is read. Another `encoder` takes the arguments of
+    `size_scale` metres count as 1. `cells` are the numbers of cells along and across, 0 for a Gaussian; `dt` are
+    seconds per step. Of `state_key` `[..., N, 4]` the speed is read. Another `encoder` takes the arguments of
     :class:`SceneEncoder`.
     """
     if cells and (cells < 3 or cells % 2 == 0):
@@ -191,10 +191,10 @@ def displacement_policy(
 
 
 class SeededNoise(TensorDictModuleBase):
-    """Gives every agent the random number its next action is decided by.
+    """Gives every agent the random number that decides its next action.
 
-    It depends on the seed, the rollout's identity, the step and the agent's place alone (never on the batch).
-    There are ``numbers`` of them per agent; 0 stands for a single one without a dimension of its own.
+    It depends only on the seed, the rollout's identity, the step and the agent's place (never on the batch). There
+    are ``numbers`` of them per agent; 0 stands for a single one without a dimension of its own.
     """
 
     in_keys = [keys.STREAM, keys.STEP, keys.VALID]  # noqa: RUF012 - the type TensorDictModuleBase declares
@@ -205,7 +205,7 @@ class SeededNoise(TensorDictModuleBase):
         self.seed, self.numbers = seed, numbers
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write numbers [..., N] or [..., N, numbers] in (0, 1)."""
+        """Write random numbers [..., N] or [..., N, numbers] in (0, 1)."""
         agents = tensordict.get(keys.VALID).shape[-1]
         place = torch.arange(agents, device=tensordict.device)
         stream, step = fold_in(tensordict.get(keys.STREAM), place), tensordict.get(keys.STEP)
@@ -288,7 +288,7 @@ def discrete_policy(
     log_prob_key: NestedKey = keys.LOG_PROB,
     encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
-    """Encoder, head and a categorical over joint actions (147 = 7 accelerations x 21 steering angles: paper, III-C).
+    """Build encoder, head and a categorical over joint actions (147 = 7 accelerations x 21 steering angles: III-C).
 
     Weights follow `torch.manual_seed`; `own_features` counts those under all `own_keys`. Reads each
     group's keys, the own features and the agents' mask; writes logits `[..., N, actions]` and actions `[..., N]`

@@ -35,7 +35,7 @@ def pool_elements(
     *,
     mode: PoolMode = "auto",
 ) -> Float[Tensor, "*b H"]:
-    """Maximum over the valid elements of a row-wise network's outputs (paper, III-C).
+    """Return the maximum over the valid elements of a row-wise network's outputs (paper, III-C).
 
     Masked elements have no influence whatever they hold. A set without a valid element gives zeros and no
     gradient. Among equal elements the first one receives the gradient.
@@ -75,7 +75,7 @@ def _wants_gradient(function: Function, elements: Float[Tensor, "*b K F"]) -> bo
 
 
 def _maxima(function: Function, sets: Sets, valid: Masks) -> Pooled:
-    """Maxima without a gradient, 0 for sets without an element."""
+    """Return maxima without a gradient, 0 for sets without an element."""
     n, count, features = sets.shape
     if not on_host(valid):
         some = max(1, AT_ONCE // count)
@@ -91,7 +91,7 @@ def _maxima(function: Function, sets: Sets, valid: Masks) -> Pooled:
 
 
 def _encoded(function: Function, flat: Float[Tensor, "e F"], valid: Bool[Tensor, " e"], dim: int = 0) -> Tensor:
-    """All elements encoded, minus infinity where they are masked; on the CPU only the others are looked at.
+    """Return all elements encoded, minus infinity where they are masked; on the CPU only the others are encoded.
 
     The function gives elements along dimension ``dim``, and so does the result.
     """
@@ -113,7 +113,7 @@ def _dense(function: Function, sets: Sets, valid: Masks) -> Pooled:
 
 
 def _through_winners(function: Function, sets: Sets, valid: Masks) -> Pooled:
-    """Output channel c of the element that has its maximum there: the other elements get no gradient anyway."""
+    """Return output channel c of the element that has its maximum there: no other element gets a gradient anyway."""
     n, count, features = sets.shape
     flat, each, places = sets.reshape(n * count, features), max(1, ROWS // count), []
     before, last = _split(function)
@@ -140,7 +140,7 @@ def _through_winners(function: Function, sets: Sets, valid: Masks) -> Pooled:
 
 
 def _split(function: Function) -> tuple[Function, nn.Linear | None]:
-    """A network before its last layer, and that layer; the whole and None where it is more than its weights."""
+    """Return a network before its last layer, and that layer; or the whole and None if it has more than weights."""
     if type(function) is nn.Sequential and not _hooked(function):
         last = function[-1]
         if type(last) is nn.Linear and last.bias is not None and not _hooked(last):
@@ -149,12 +149,12 @@ def _split(function: Function) -> tuple[Function, nn.Linear | None]:
 
 
 def _own_channel(before: Function, last: nn.Linear | None, chosen: Float[Tensor, "n H F"]) -> Pooled:
-    """Output channel c of element c; of a last layer one output in H is computed."""
+    """Return output channel c of element c; of a last layer one output in H is computed."""
     hidden = before(chosen.flatten(0, 1)).unflatten(0, chosen.shape[:2])
     return hidden.diagonal(dim1=1, dim2=2) if last is None else (hidden * last.weight).sum(-1) + last.bias
 
 
 def _hooked(module: nn.Module) -> bool:
-    """Whether a module does more, when it is called or differentiated, than its weights tell."""
+    """Return whether a module does more, when it is called or differentiated, than its weights tell."""
     before, after = module._forward_pre_hooks, module._forward_hooks
     return bool(before or after or module._backward_pre_hooks or module._backward_hooks)

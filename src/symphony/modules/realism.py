@@ -19,15 +19,15 @@ _GAP, _ROAD = 3, 2 * 5
 
 
 class Discriminator(nn.Module):
-    """Max-pool over all objects and map points within a radius, and a head that gives one logit per agent.
+    """Max-pools over all objects and map points within a radius, with a head that gives one logit per agent.
 
     The logit is high for states that look simulated: D = sigmoid(logit) is the probability of that.
 
     Own features include the route where there is one; the first two of an object and of a map or light point are its
     position in the agent's frame, in whose units ``radius`` says how far it observes. ``features`` are ``paper``;
     ``clearance``, which adds the signed gap to the box of each object and the signed distances of centre and corners
-    to the edge of the road; or ``foresight``, which adds to these the gaps at :data:`FORESIGHT`, were everyone to
-    keep speed and course.
+    to the edge of the road; or ``foresight``, which adds to these the gaps at :data:`FORESIGHT` if all keep speed and
+    course.
     """
 
     def __init__(
@@ -60,8 +60,8 @@ class Discriminator(nn.Module):
         road: Float[Tensor, "*b N 5"] | None = None,
         *gaps: Float[Tensor, "*b N O"] | Float[Tensor, "*b N O H"],
     ) -> Float[Tensor, "*b N"]:
-        """Logits `[..., N]`, 0 for padded agents; shapes as for :class:`SceneEncoder`, road `[..., N, 5]`, gaps
-        `[..., N, O]` and with foresight `[..., N, O, H]`.
+        """Compute logits `[..., N]`, 0 for padded agents; shapes as for :class:`SceneEncoder`, road `[..., N, 5]`,
+        gaps `[..., N, O]` and with foresight `[..., N, O, H]`.
         """
         objects_mask = objects_mask & self._near(objects)
         points_mask = points_mask & self._near(points)
@@ -91,7 +91,7 @@ def discriminator(
     head: Sequence[int] = (64,),
     features: Features = "clearance",
 ) -> TensorDictModule:
-    """A :class:`Discriminator` that reads an observation and writes its logits `[..., N]`."""
+    """Build a :class:`Discriminator` that reads an observation and writes its logits `[..., N]`."""
     network = Discriminator(
         own_features,
         object_features,

@@ -19,7 +19,7 @@ __all__ = ["BCLoss", "DiscriminatorLoss", "DistillationLoss", "GoalLoss", "MGAIL
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for, and no other loss."""
+    """Import the named loss, and no other."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     rooms = {"auc": "statistics", "BCLoss": "base", "DistillationLoss": "base"}

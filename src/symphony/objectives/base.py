@@ -1,4 +1,4 @@
-"""What the losses of this package share: settable keys, masks, reductions; and those that imitate actions."""
+"""The shared parts of the losses: settable keys, masks, reductions; and the base of those that imitate actions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class MaskedLoss(LossModule):
         pass
 
     def _read_keys(self) -> list[NestedKey]:
-        """What the loss reads beside the mask."""
+        """Return the keys that the loss reads besides the mask."""
         raise NotImplementedError
 
     def set_keys(self, **kwargs: Any) -> None:
@@ -57,7 +57,7 @@ class MaskedLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What the loss reads: the network's inputs, the labels and, where there is one, the mask."""
+        """The keys that the loss reads: the network's inputs, the labels and, where there is one, the mask."""
         if self._in_keys is None:
             keys = self._read_keys()
             if self.use_mask is not False:
@@ -70,7 +70,7 @@ class MaskedLoss(LossModule):
         self._in_keys = values
 
     def _mask(self, tensordict: TensorDictBase) -> Shaped[Tensor, "*b"] | None:
-        """What the TensorDict holds under the `valid` key, by the rule of `use_mask`."""
+        """Return the entry under the `valid` key, by the rule of `use_mask`."""
         if self.use_mask is False:
             return None
         key = unravel_key(self.tensor_keys.valid)
@@ -82,7 +82,7 @@ class MaskedLoss(LossModule):
     def _entries(
         self, tensordict: TensorDictBase, key: NestedKey, what: str, shape: torch.Size
     ) -> Shaped[Tensor, "*b"]:
-        """A tensor with one number per entry. Raises KeyError if it is absent, ValueError for another shape."""
+        """Return a tensor with one number per entry; KeyError if it is absent, ValueError for another shape."""
         value = tensordict.get(key, default=None)
         if value is None:
             raise KeyError(f"no {what} under {key!r}")
@@ -91,14 +91,14 @@ class MaskedLoss(LossModule):
         return value
 
     def _flags(self, tensordict: TensorDictBase, key: NestedKey, what: str, shape: torch.Size) -> Bool[Tensor, "*b"]:
-        """Likewise for bools: `~` of an integer would be another integer, silently."""
+        """Return a bool tensor with one flag per entry: `~` of an integer would silently be another integer."""
         value = self._entries(tensordict, key, what, shape)
         if value.dtype != torch.bool:
             raise ValueError(f"{what} {key!r} is {value.dtype}, expected torch.bool")
         return value
 
     def _counted(self, tensordict: TensorDictBase, shape: torch.Size, device: torch.device) -> Bool[Tensor, "*b"]:
-        """Bool mask of the entries that are valid and that no mask written by TorchRL itself leaves out."""
+        """Return a bool mask of the entries that are valid and that no mask written by TorchRL itself leaves out."""
         counted = torch.ones(shape, dtype=torch.bool, device=device)
         if self._mask(tensordict) is not None:
             counted = self._flags(tensordict, self.tensor_keys.valid, "mask", shape)
@@ -111,7 +111,7 @@ class MaskedLoss(LossModule):
     def _reduced(
         self, values: Float[Tensor, "*b"], counted: Bool[Tensor, "*b"], reduction: Reduction | None = None
     ) -> Float[Tensor, ""] | Float[Tensor, "*b"]:
-        """Mean (0 without entries) or sum over the counted entries, or their values with zeros elsewhere."""
+        """Return mean (0 without entries) or sum over the counted entries, or their values with zeros elsewhere."""
         reduction = self.reduction if reduction is None else reduction
         # Selected, not multiplied: what is left out may not be finite.
         values = torch.where(counted, values, torch.zeros_like(values))
@@ -123,12 +123,12 @@ class MaskedLoss(LossModule):
         return values.sum() / torch.where(number > 0, number, 1)
 
     def _number(self, counted: Bool[Tensor, "*b"]) -> Num[Tensor, ""]:
-        """How many entries count, or what stands for it where processes train together."""
+        """Return how many entries count, averaged over processes that train together."""
         return counted.sum() if self.share_count is None else self.share_count(counted.sum())
 
 
 class Fit(NamedTuple):
-    """How well an actor explains the actions of a batch. All `[...]`.
+    """The fit of an actor to the actions of a batch. All `[...]`.
 
     Attributes:
         cost: negative log-likelihood after label smoothing.
@@ -209,7 +209,7 @@ class ActorLoss(MaskedLoss):
             return Fit(cost, nll, counted, dist.entropy(), hit)
 
     def _statistics(self, fit: Fit, counted: Bool[Tensor, "*b"]) -> dict[str, Float[Tensor, "*_"]]:
-        """Entropy and accuracy over some entries, of a categorical actor."""
+        """Return entropy and accuracy over some entries, of a categorical actor."""
         if fit.entropy is None or fit.hit is None:
             return {}
         reduction: Reduction = "none" if self.reduction == "none" else "mean"
@@ -220,13 +220,13 @@ class ActorLoss(MaskedLoss):
 
 
 def _even(logits: Float[Tensor, "*b C"]) -> Float[Tensor, "*b"]:
-    """Negative log-likelihood of a target spread evenly over all categories that are possible at all."""
+    """Return the negative log-likelihood of a target spread evenly over all possible categories."""
     possible = logits > -torch.inf
     return -torch.where(possible, logits, 0.0).sum(-1) / possible.sum(-1)
 
 
 def _is_categorical(actor: Any) -> bool:
-    """Whether the actor's distribution is a torch Categorical (over indices, or one-hot as TorchRL's)."""
+    """Return whether the actor's distribution is a torch Categorical (over indices, or one-hot as TorchRL's)."""
     heads = [m for m in actor.modules() if isinstance(m, ProbabilisticTensorDictModule)]
     kind = heads[-1].distribution_class if heads else None
     return isinstance(kind, type) and issubclass(kind, Categorical)
@@ -235,8 +235,8 @@ def _is_categorical(actor: Any) -> bool:
 class BCLoss(ActorLoss):
     """Negative log-likelihood of expert actions under a stochastic actor (paper, II-B).
 
-    Unlike TorchRL's class of this name it takes its distribution from the actor whatever the keys are called,
-    and leaves padded agents out. Also for other labels drawn from a distribution, such as goals.
+    Unlike TorchRL's class of this name it takes its distribution from the actor whatever the keys are called, and
+    leaves padded agents out. It also serves other labels drawn from a distribution, such as goals.
 
     Args:
         actor_network: probabilistic module with a `get_dist`.

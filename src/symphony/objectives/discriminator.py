@@ -1,4 +1,4 @@
-"""Telling simulated states from logged ones."""
+"""The loss of a discriminator between simulated and logged states."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ class DiscriminatorLoss(MaskedLoss):
         return result
 
     def _leaves(self, inputs: TensorDictBase) -> list[Float[Tensor, "*_"]]:
-        """The inputs to differentiate by, put in place as leaves."""
+        """Return the inputs to differentiate by, put in place as leaves."""
         chosen = [key for key in self.discriminator.in_keys if inputs.get(key).is_floating_point()]
         leaves = [inputs.get(key).detach().requires_grad_() for key in chosen]
         for key, leaf in zip(chosen, leaves, strict=True):
@@ -160,7 +160,7 @@ def _squared_norm(
     *,
     create_graph: bool,
 ) -> Float[Tensor, "*b"]:
-    """Squared norm `[..., N]` of each logit's gradient with respect to its own entry's inputs."""
+    """Return the squared norm `[..., N]` of each logit's gradient with respect to its own entry's inputs."""
     total = torch.where(where, logit, 0.0).sum()
     gradients = torch.autograd.grad(total, leaves, create_graph=create_graph, allow_unused=True)
     squared = torch.zeros_like(logit)

@@ -1,4 +1,4 @@
-"""Likelihood of goals."""
+"""The likelihood of goals as a loss."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from symphony.objectives.base import MaskedLoss, Reduction
 
 
 class GoalLoss(MaskedLoss):
-    """Negative log-likelihood of the goal an expert had, under a softmax over its feasible goals (paper, III-B).
+    """Negative log-likelihood of an expert's goal, under a softmax over its feasible goals (paper, III-B).
 
     Where the log does not tell which of several goals it was, the label may be their set: the loss is then minus the
     logarithm of their summed probability, and any of them is right. A set of one is that label.
 
-    Entries without a known goal (label -1, an empty set) or without any feasible one are left out, like invalid
-    ones. What the logits of goals that are not feasible hold has no influence.
+    Entries without a known goal (label -1, an empty set) or without any feasible one are left out, like invalid ones.
+    The logits of infeasible goals have no influence.
 
     Args:
         goal_network: module that writes logits `[..., N, G]`; of a probabilistic one only the part that computes
@@ -126,7 +126,7 @@ class GoalLoss(MaskedLoss):
     def _right(
         self, tensordict: TensorDictBase, shape: torch.Size
     ) -> tuple[Bool[Tensor, "*b N G"], Bool[Tensor, "*b N"]]:
-        """The right goals `[..., N, G]`, and where any is known `[..., N]`."""
+        """Return the right goals `[..., N, G]`, and where any is known `[..., N]`."""
         if tensordict.get(self.tensor_keys.label_set, default=None) is not None:
             right = self._flags(tensordict, self.tensor_keys.label_set, "set of labels", shape)
             return right, right.any(-1)
@@ -136,7 +136,7 @@ class GoalLoss(MaskedLoss):
     def _check(
         self, right: Bool[Tensor, "*b N G"], feasible: Bool[Tensor, "*b N G"], counted: Bool[Tensor, "*b N"]
     ) -> None:
-        """Raises ValueError for a label that is no feasible goal; an accelerator stops with an error of its own."""
+        """Raise ValueError for a label that is not a feasible goal; an accelerator stops with an error of its own."""
         wrong = counted & (~right.any(-1) | (right & ~feasible).any(-1))
         key = self.tensor_keys.label
         if wrong.device.type != "cpu":

@@ -26,13 +26,13 @@ vanishes where D is sure of the log; -log(1 - D), whose gradient vanishes where 
 
 
 class MGAILLoss(MaskedLoss):
-    """How simulated the states look that an actor drives through, with gradient through the dynamics (paper, III-C;
+    """Adversarial loss of an actor: how simulated its states look, with gradient through the dynamics (paper, III-C;
     Baram et al. 2017).
 
     The loss simulates from the states it is given, by the actor's reparameterised draws, and averages a cost of the
-    discriminator's logit over all steps and agents. Only the actor receives a gradient. With given random
-    numbers it repeats a rollout found before, such as the survivors of a beam search: the gradient is then that
-    through the search with its choices held fixed, at the memory of the survivors alone.
+    discriminator's logit over all steps and agents. Only the actor receives a gradient. With given random numbers it
+    repeats an earlier rollout, such as the survivors of a beam search: the gradient is then that through the search
+    with its choices held fixed, at the memory of the survivors alone.
 
     Args:
         actor_network: draws with gradient (`has_rsample`).
@@ -55,7 +55,7 @@ class MGAILLoss(MaskedLoss):
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that can be set by `.set_keys(name=key)`.
+        """Return keys that can be set by `.set_keys(name=key)`.
 
         Attributes:
             score (NestedKey): float `[..., N]`, the logit the discriminator writes.
@@ -119,7 +119,7 @@ class MGAILLoss(MaskedLoss):
 
     @property
     def env(self) -> EnvBase | None:
-        """What is simulated in."""
+        """The environment in which the actor is simulated."""
         return self._held["env"]
 
     @env.setter
@@ -166,7 +166,7 @@ class MGAILLoss(MaskedLoss):
     def _simulate(
         self, env: EnvBase, now: TensorDictBase, numbers: Float[Tensor, "*_"] | None, steps: int
     ) -> tuple[Float[Tensor, "*b T N"], Bool[Tensor, "*b T N"]]:
-        """Logits and whether the episode still ran, `[..., steps, N]`."""
+        """Return logits and whether the episode still ran, `[..., steps, N]`."""
         batch, scores, going = now.batch_dims, [], []
         alive = torch.ones_like(now.get(self.tensor_keys.done))
         frozen = {name: weight.detach() for name, weight in self.discriminator.named_parameters()}

@@ -1,4 +1,4 @@
-"""How well scores tell two kinds apart."""
+"""Statistics of how well scores tell two kinds apart."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 def auc(
     scores: Float[Tensor, "*b"], positive: Bool[Tensor, "*b"], valid: Bool[Tensor, "*b"] | None = None
 ) -> Float[Tensor, ""]:
-    """Probability that a positive scores higher than a negative, ties counting one half (area under the ROC curve).
+    """Return the probability that a positive scores higher than a negative, ties counting half (the area under ROC).
 
     The rank statistic of Mann and Whitney, O(n log n), over all entries. No gradient.
 

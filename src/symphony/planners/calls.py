@@ -1,4 +1,4 @@
-"""Asking planners, whatever they do: exceptions are caught, and they have so many seconds for an answer."""
+"""Calls of planners, whatever they do: exceptions are caught, and each answer has a time limit."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ SECONDS = 60.0
 
 
 class _Overdue(BaseException):
-    """Raised in the planner's own code; no ``except Exception`` there stops it."""
+    """The error raised in the planner's own code; no ``except Exception`` there stops it."""
 
 
 def plans_of(planners: Sequence[Planner], seen: Sequence[Traffic], seconds: float = SECONDS) -> list[Any]:
-    """Ask planners, each for what it sees; gives plans in their order, or the exceptions that the calls ended with.
+    """Ask planners, each for what it sees; return plans in their order, or the exceptions that ended the calls.
 
-    Those of one class that has ``plan_batch`` are asked together, and fail together. Each call may take so many
-    seconds; in threads other than the first there is no limit.
+    Those of one class that has ``plan_batch`` are asked together, and fail together. Each call may take ``seconds``;
+    in threads other than the first there is no limit.
     """
     found: list[Any] = [None] * len(planners)
     together: dict[type, list[int]] = {}
@@ -48,7 +48,7 @@ def _batch(kind: Any, planners: list[Planner], seen: list[Traffic]) -> list[Any]
 
 
 def answer(call: Any, *args: Any, seconds: float = SECONDS) -> Any:
-    """Call a planner; gives what it returns, or the exception it ended with: a TimeoutError if it took too long."""
+    """Call a planner; return what it returns, or the exception that ended it: a TimeoutError if it took too long."""
     try:
         with _at_most(seconds):
             return call(*args)
@@ -62,7 +62,7 @@ def answer(call: Any, *args: Any, seconds: float = SECONDS) -> Any:
 
 @contextlib.contextmanager
 def _at_most(seconds: float) -> Iterator[None]:
-    """Inside, ``_Overdue`` is raised after so many seconds, where there are signals to be had."""
+    """Raise ``_Overdue`` inside after this many seconds, where signals are available."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

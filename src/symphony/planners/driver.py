@@ -1,4 +1,4 @@
-"""The ego by a planner: planners as a part of the policy, forked with the branches that they drive."""
+"""Planners of the ego as a part of the policy, forked with the branches that they drive."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ POINTS = 20  # of a trajectory that are kept, at most
 
 
 class PlannedEnv(DrivingEnv):
-    """Driving in which actions are not all: background agents go where ``BACKGROUND`` says, and the first P
-    interactive agents, the ego and others with planners, where ``PLANNED`` does; where there is no such entry, they
+    """A driving environment with states besides actions: background agents go where ``BACKGROUND`` says, and the
+    first P interactive agents, the ego and others with planners, where ``PLANNED`` says; without such an entry they
     act like the others.
     """
 
@@ -58,14 +58,14 @@ class PlannedEnv(DrivingEnv):
 
 
 class Failure(NamedTuple):
-    """Why a planner drives no more: from which step on the rollout doesn't count, and the reason in words."""
+    """The failure of a planner: from which step on the rollout doesn't count, and the reason in words."""
 
     step: int
     reason: str
 
 
 class EgoPlanners(NamedTuple):
-    """How one agent of each scene of a batch is planned: the ego, or another, which is the ego of its planner.
+    """The planner of one agent in each scene of a batch: the ego, or another, which is the ego of its planner.
 
     Attributes:
         name: of the planner.
@@ -83,7 +83,7 @@ class EgoPlanners(NamedTuple):
 def ego_planners(
     planners: Planners, segments: Sequence[RunSegment], interactive: Int[Tensor, "B N"], seconds: float
 ) -> list[EgoPlanners]:
-    """How the first interactive agents of scenes are planned, given the rows of all of them in their segments.
+    """Return how the first interactive agents of scenes are planned, given the rows of all of them in their segments.
 
     Raises:
         ConfigError: in some segment another agent has the place of one with a planner.
@@ -99,10 +99,10 @@ def ego_planners(
 
 
 class EgoPolicy(TensorDictModuleBase):
-    """Asks planners and writes the states they lead to as ``PLANNED``: of the first interactive agents, one each.
+    """Asks planners, one for each of the first interactive agents, and writes the resulting states as ``PLANNED``.
 
-    Rollouts name their planners by number (``PLANNER``). Copies of a branch share a number until they are driven on;
-    then each gets a planner of its own, copied before any of them plans.
+    Rollouts name their planners by number (``PLANNER``). Copies of a branch share a number until they go on; then
+    each gets a planner of its own, copied before any of them plans.
 
     Args:
         env: the environment.
@@ -113,7 +113,7 @@ class EgoPolicy(TensorDictModuleBase):
         forked: a search will copy planners with its branches.
 
     Raises:
-        ConfigError: ``forked``, and they can't be copied: said now, as it may take long until one has to be.
+        ConfigError: ``forked``, and they can't be copied: reported now, as it may be long until one has to be.
     """
 
     in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID, keys.PROGRESS, keys.PLANNER]  # noqa: RUF012
@@ -148,12 +148,12 @@ class EgoPolicy(TensorDictModuleBase):
         return tensordict.set(keys.PLANNER, torch.stack(numbers, -1))
 
     def failures(self, number: Int[Tensor, "*b P"]) -> list[Failure | None]:
-        """The first failure of the planners with these numbers, flattened; None where all of them drive on."""
+        """Return the first failure of the planners with these numbers, flattened; None where all of them drive on."""
         each = (one.failures(part) for one, part in zip(self.drivers, number.unbind(-1), strict=True))
         return [min(filter(None, found), default=None) for found in zip(*each, strict=True)]
 
     def meant(self, number: Int[Tensor, "K P"], steps: int) -> NDArray[np.float32] | None:
-        """The trajectories [K, P, T, H, 2] that planners gave back, NaN for none; None without any."""
+        """Return the trajectories [K, P, T, H, 2] that planners returned, NaN for none; None if there are none."""
         asked = [(k, one) for k, one in enumerate(self.drivers) if isinstance(one, _Asked)]
         given = {k: plan for k, one in asked if (plan := one.meant(number[:, k], steps)) is not None}
         most = max((plan.shape[2] for plan in given.values()), default=0)
@@ -164,7 +164,7 @@ class EgoPolicy(TensorDictModuleBase):
 
 
 class _Driver:
-    """Of each scene the agent at a place among the interactive ones: its row, and words before its failures."""
+    """The agent at one place among the interactive ones of each scene: its row, and a prefix for its failures."""
 
     def __init__(self, env: DrivingEnv, egos: EgoPlanners, place: int) -> None:
         self.env, self.egos, self.place = env, egos, place
@@ -192,16 +192,16 @@ class _Ruled(_Driver):
         self.lost = scenes.route_logged[:, place] < 0
 
     def begin(self, start: TensorDictBase) -> Tensor:
-        """The numbers [..., 1] of the planners."""
+        """Return the numbers [..., 1] of the planners."""
         return start.get(keys.SCENE).clone()
 
     def moved(self, tensordict: TensorDictBase, number: Tensor) -> tuple[Tensor, Tensor]:
-        """Planned states [..., 4] and numbers of planners [...]."""
+        """Return planned states [..., 4] and numbers of planners [...]."""
         moved = self.rule(tensordict.select(*self.rule.in_keys)).get(keys.BACKGROUND)
         return moved[..., self.place, :], number
 
     def failures(self, number: Int[Tensor, "*b"]) -> list[Failure | None]:
-        """The failures of agents in these scenes, flattened: those on no lane fail from the first step on."""
+        """Return the failures of agents in these scenes, flattened: those on no lane fail from the first step on."""
         rows, why = number.flatten().tolist(), "reset: the ego is on no lane that it could follow"
         lost = self.lost.tolist()
         return [Failure(0, f"{self.who[row]}{why}") if lost[row] else None for row in rows]
@@ -251,18 +251,18 @@ class _Asked(_Driver):
         return Failure(step, f"{self.who[row]}{when}: {_words(error)}")
 
     def begin(self, start: TensorDictBase) -> Tensor:
-        """The numbers [..., 1] of the planners."""
+        """Return the numbers [..., 1] of the planners."""
         return torch.arange(start.numel(), device=start.device).reshape(*start.shape, 1)
 
     def _route(self, row: int) -> NDArray[np.float32]:
-        """Points [P, 2] of the route that the agent of a scene takes; none if it is on no lane."""
+        """Return points [P, 2] of the route that the agent of a scene takes; none if it is on no lane."""
         which = int(self.env.scenes.route_logged[row, self.place])
         if which < 0:
             return np.zeros((0, 2), np.float32)
         return self.env.scenes.whole_route(row, self.place, which).cpu().numpy()
 
     def moved(self, tensordict: TensorDictBase, number: Tensor) -> tuple[Tensor, Tensor]:
-        """Planned states [..., 4] and numbers of planners [...]."""
+        """Return planned states [..., 4] and numbers of planners [...]."""
         scene, at, place = *(tensordict.get(key).flatten() for key in (keys.SCENE, keys.STEP)), self.place
         state, valid, progress = (
             tensordict.get(key).flatten(0, tensordict.ndim - 1) for key in (keys.STATE, keys.VALID, keys.PROGRESS)
@@ -308,12 +308,12 @@ class _Asked(_Driver):
         return after.reshape(*tensordict.shape, 4), number.new_tensor(numbers).reshape(tensordict.shape)
 
     def failures(self, number: Int[Tensor, "*b"]) -> list[Failure | None]:
-        """The failures of the planners with these numbers, flattened; None for those that drive on."""
+        """Return the failures of the planners with these numbers, flattened; None for those that drive on."""
         found = (self._held[n] for n in number.flatten().tolist())
         return [planner if isinstance(planner, Failure) else None for planner in found]
 
     def meant(self, number: Int[Tensor, "*b"], steps: int) -> NDArray[np.float32] | None:
-        """See :meth:`EgoPolicy.meant`."""
+        """Return the planned trajectories, see :meth:`EgoPolicy.meant`."""
         given = [self._meant[n] for n in number.flatten().tolist()]
         most = max((len(plan) for plans in given for plan in plans.values()), default=0)
         found = np.full((len(given), steps, most, 2), np.nan, np.float32)
@@ -323,7 +323,7 @@ class _Asked(_Driver):
         return found if most else None
 
     def _own(self, numbers: list[int], going: list[bool]) -> list[int]:
-        """Numbers of planners that may be changed, one for each rollout that goes on."""
+        """Return numbers of planners that may be changed, one for each rollout that goes on."""
         self._held = {n: self._held[n] for n in set(numbers)}
         self._meant = {n: self._meant[n] for n in set(numbers)}
         self._past = {n: self._past[n] for n in set(numbers)}
@@ -351,7 +351,7 @@ class _Asked(_Driver):
 
 
 def route_from(route: NDArray[Any], progress: float) -> NDArray[np.float64]:
-    """Points [K, 2] of a route from so many metres along on, at least 200 m of it or all there is."""
+    """Return points [K, 2] of a route from ``progress`` metres on, at least 200 m of it or all there is."""
     if not len(route):
         return route.astype(np.float64)
     piece = min(int(progress // SPACING), len(route) - 2)
@@ -363,13 +363,13 @@ def route_from(route: NDArray[Any], progress: float) -> NDArray[np.float64]:
 
 
 def _shown(plan: Any) -> NDArray[np.float32]:
-    """Points [H, 2] of a trajectory, at most :data:`POINTS` of them, the last among them."""
+    """Return points [H, 2] of a trajectory, at most :data:`POINTS` of them, the last among them."""
     points = np.asarray(plan, np.float32)[:, :2]
     return points[np.linspace(0, len(points) - 1, min(len(points), POINTS)).round().astype(int)]
 
 
 def _words(error: Exception) -> str:
-    """An exception on one line, with the place that raised it."""
+    """Return an exception on one line, with the place that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
     return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}{place}"

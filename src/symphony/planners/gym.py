@@ -35,20 +35,20 @@ Observed = dict[str, NDArray[Any]]
 
 
 class DrivingGym(gymnasium.Env[Observed, Any]):
-    """One ego in a logged scene, everyone else played back from the log; an episode is a run segment.
+    """One ego in a logged scene, with all others played back from the log; an episode is a run segment.
 
     Observations are what :class:`symphony.envs.driving.DrivingEnv` shows an agent, in its own frame: ``own``,
     ``objects`` and ``points`` with their masks, ``route`` where asked for (the one the log took). The rest is in
     ``info``: ``segment`` (its id), ``step``, ``state`` (x, y in metres, heading in radians, speed in m/s),
-    ``collision``, ``offroad``, and ``driven``, metres since the step before. What a planner would be told is
-    :meth:`seen`.
+    ``collision``, ``offroad``, and ``driven``, metres since the step before. :meth:`seen` returns what a planner
+    would be told.
 
     Args:
         data: a store of run segments, or its folder.
         action: ``discrete``: the kinematic bicycle's joint actions; ``continuous``: the displacement over a step,
             forward and to the left, where 1 stands for :data:`TOP_SPEED`.
         observation: what the ego observes.
-        reward: of a step, from the state before and the state after it, as of ``DrivingEnv``; by default -1 where
+        reward: of a step, from the state before and the state after it, as for ``DrivingEnv``; by default -1 where
             the ego collides or is off the road.
         ends_on: what ends an episode early.
         duration: seconds of each segment that are driven; 0 for all.
@@ -102,8 +102,8 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
     ) -> tuple[Observed, dict[str, Any]]:
         """Start a segment.
 
-        Raises a :class:`DataError` where the one that was asked for is not there, or its ego is not seen at its first
-        step, a :class:`ConfigError` where what was asked for is neither an id nor a number.
+        Raises a :class:`DataError` where the requested one does not exist, or its ego is not seen at its first step,
+        a :class:`ConfigError` where the request is neither an id nor a number.
         """
         super().reset(seed=seed)
         wanted = (options or {}).get("segment")
@@ -125,7 +125,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
     def step(self, action: Any) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Drive one step.
 
-        Raises a :class:`ConfigError` where the action is none of the space; continuous ones beyond it are clipped.
+        Raises a :class:`ConfigError` where the action is not in the space; continuous ones beyond it are clipped.
         """
         if isinstance(self.dynamics, Bicycle):
             number = _whole(action)
@@ -146,7 +146,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         return self._observed(), reward, ended, cut, self._info(driven)
 
     def seen(self) -> Observation:
-        """What a planner that is a function would observe now; its seed is 0."""
+        """Return what a planner that is a function would observe now; its seed is 0."""
         ego, state = self.segment.ego, self._now.get(keys.STATE)[0].double().numpy()
         if self._told is None:
             graph, route = LaneGraph(self.segment.road), np.zeros((0, 2), np.float32)
@@ -186,7 +186,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         self._now = self.env.start(torch.tensor(0), goal=made.route_logged[0] if graph else None)
 
     def _observed(self) -> Observed:
-        """The ego's observation, as NumPy arrays."""
+        """Return the ego's observation as NumPy arrays."""
         seen: Observed = {}
         for name, value in self._now.get(("agents", "observation")).items():
             array = value[0].numpy()
@@ -206,7 +206,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
 
 
 def _whole(value: Any) -> int | None:
-    """A single whole number, such as an int, a NumPy scalar or a tensor; None for anything else."""
+    """Return a single whole number, such as an int, a NumPy scalar or a tensor; None for anything else."""
     number = np.asarray(value)
     return int(number) if number.shape == () and number.dtype.kind in "iu" else None
 

@@ -1,4 +1,4 @@
-"""Planners as digests: another one of the same name is another simulation."""
+"""Digests of planners: another planner of the same name makes another simulation."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _PLACE = re.compile(" at 0x[0-9A-Fa-f]+")
 
 
 def source_of(planner: str | Callable[..., Any]) -> str:
-    """A digest of the code that a planner is made of, as far as its name tells, and of what was bound to it: by
-    ``functools.partial``, as an object's attributes, by the function around it.
+    """Return a digest of the code that a planner is made of, as far as its name tells, and of what was bound to it:
+    by ``functools.partial``, as an object's attributes, by the function around it.
 
-    For a command it is that of what it starts, where that is a file, and of the first other word that is one. Empty
-    for what comes with the package, and where no source is known.
+    For a command it is that of the program it starts, if that is a file, and of the first other word that is one.
+    Empty for what comes with the package, and where no source is known.
     """
     if isinstance(planner, str) and planner.startswith(PIPE):
         words = shlex.split(planner.removeprefix(PIPE))
@@ -50,7 +50,7 @@ def source_of(planner: str | Callable[..., Any]) -> str:
 
 
 def planner_settings(planners: Planners, seconds: float) -> dict[str, Any]:
-    """What tells a simulation with planners, which have so many seconds for an answer, from others.
+    """Return the settings that distinguish a simulation with planners, given their seconds for an answer.
 
     Raises:
         ConfigError: there is no such planner, or it can't be made.
@@ -63,7 +63,7 @@ def planner_settings(planners: Planners, seconds: float) -> dict[str, Any]:
 
 
 def _content(value: Any, inside: tuple[int, ...] = ()) -> str:
-    """A value in words that are the same in every process, and others where any part of it is another.
+    """Return a value in words that are the same in every process, and differ where any part of it differs.
 
     What Python prints of an array leaves out its middle, of a set is in any order, and of an object may be its name
     only.

@@ -1,4 +1,4 @@
-"""Two planners: one that follows its route and whoever is in front (``idm``), and the log itself (``log``)."""
+"""Two planners: one that follows its route and the vehicle ahead (``idm``), and the log itself (``log``)."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ AT_STOP, STOP_CHORD = 1.5, 15.0
 
 
 class LogPlanner:
-    """Plays back what the ego did, in a straight line over holes of the log; the run fails where the log ends."""
+    """Plays back the ego's log, in a straight line across its gaps; the run fails where the log ends."""
 
     def reset(self, scenario: Scenario) -> None:
-        """Remember the log, its holes filled."""
+        """Remember the log, its gaps filled."""
         known = np.flatnonzero(scenario.log_valid)
         self.log, self.last = scenario.log.copy(), int(known[-1])
         self.log[known, 2] = np.unwrap(self.log[known, 2])
@@ -34,7 +34,7 @@ class LogPlanner:
             column[holes] = np.interp(holes, known, column[known])
 
     def plan(self, traffic: Traffic) -> Pose:
-        """The next logged state."""
+        """Return the next logged state."""
         if traffic.step >= self.last:
             raise ValueError(f"the log of the ego ends at step {self.last}")
         return Pose(*self.log[traffic.step + 1].tolist())
@@ -46,10 +46,10 @@ class IDMPlanner:
 
     Acceleration a (1 - (v / v0)^4 - (s* / s)^2) with s* = s0 + max(0, v T + v dv / (2 sqrt(a b))), s the gap to the
     nearest box that reaches into the route's corridor ahead, or to a stop line that is red (Treiber, Hennecke,
-    Helbing, "Congested traffic states in empirical observations and microscopic simulations", Phys. Rev. E 62,
-    2000). v0 is the lanes' speed limit, less where a bend or a lower limit comes near. Steering leads the rear axle
-    to a point ahead (Coulter, "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01, 1992).
-    It gives no way to crossing traffic that is not on its route yet.
+    Helbing, "Congested traffic states in empirical observations and microscopic simulations", Phys. Rev. E 62, 2000).
+    v0 is the lanes' speed limit, less where a bend or a lower limit comes near. Steering leads the rear axle to a
+    point ahead (Coulter, "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01, 1992). It
+    does not yield to crossing traffic that is not on its route yet.
 
     It is not asked step by step: the rule that also drives background traffic moves the egos of all rollouts at once,
     :class:`symphony.rollouts.background.CarFollower`, with these parameters. Others are given by

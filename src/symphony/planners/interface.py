@@ -1,4 +1,4 @@
-"""A planner of one's own as the ego: what it is told, what it observes and what it gives back.
+"""The interface of a user's planner of the ego: what it is told, what it observes and what it returns.
 
 Plain Python and NumPy. World frame of the run segment, metres, seconds, m/s, radians counter-clockwise. Arrays are
 read-only. Legend: A agents of the segment, Q lights, P points, T logged steps.
@@ -65,7 +65,7 @@ class Control(NamedTuple):
 
 @dataclass(frozen=True)
 class Traffic:
-    """Everyone at one step, the ego included.
+    """All agents at one step, the ego included.
 
     Attributes:
         step: since the start; 0 at the first call.
@@ -77,13 +77,13 @@ class Traffic:
         velocity: [A, 2].
         size: [A, 2] length, width.
         agent_type: [A] :class:`symphony.data.segment.AgentType`.
-        valid: [A] who is there.
+        valid: [A] which agents are present.
         lights: [Q] :class:`symphony.data.segment.SignalState` of each light of the scenario.
-        route: [K, 2] points to follow from where the ego has come to, 3 m apart: 200 m of the scenario's route, or
-            what there is of it up to the end of the map.
-        past: [H, A, 5] x, y, heading and velocity of everyone at the steps before, the oldest first: of the last
+        route: [K, 2] points to follow from the ego's place on, 3 m apart: 200 m of the scenario's route, or what
+            there is of it up to the end of the map.
+        past: [H, A, 5] x, y, heading and velocity of all agents at the steps before, the oldest first: of the last
             :data:`HISTORY` seconds, or as many as there were since the start; 0 where not valid.
-        past_valid: [H, A] who was there.
+        past_valid: [H, A] which agents were present.
     """
 
     step: int
@@ -125,7 +125,7 @@ class Scenario:
         agent_id: [A] the source's ids.
         log: [T, 4] what the ego did, for planners that play it back.
         log_valid: [T].
-        seed: for random numbers of the planner's own, which should come from nothing else; another for each rollout.
+        seed: of the planner's own random numbers, which should depend on nothing else; another for each rollout.
     """
 
     segment_id: str
@@ -151,13 +151,13 @@ class Scenario:
 class Planner(Protocol):
     """Drives the ego of one rollout. It is made without arguments.
 
-    A class may also have ``plan_batch(planners, traffics)``, a class method: all its planners of a batch of rollouts
-    and what each of them sees, lists of one length; it gives back as many plans. Then ``plan`` is not called.
+    A class may also have a class method ``plan_batch(planners, traffics)``: it takes all its planners of a batch of
+    rollouts and what each of them sees, lists of one length, and returns as many plans. Then ``plan`` is not called.
 
-    A search forks planners by ``copy.deepcopy``; one that can't be copied drives with ``--search none``. A copy
-    draws the same random numbers as the one it was made of, if it draws them as :attr:`Scenario.seed` says. One that
-    raises an exception, or gives back what is not finite, of another length or a target farther away than
-    :data:`MAX_SPEED` allows, makes its run a failed one; the run's later steps don't count.
+    A search forks planners by ``copy.deepcopy``; one that can't be copied drives with ``--search none``. A copy draws
+    the same random numbers as the one it was made of, if it draws them as :attr:`Scenario.seed` says. One that raises
+    an exception, or returns what is not finite, of another length or a target farther away than :data:`MAX_SPEED`
+    allows, makes its run a failed one; the run's later steps don't count.
     """
 
     def reset(self, scenario: Scenario) -> None:
@@ -165,7 +165,7 @@ class Planner(Protocol):
         ...
 
     def plan(self, traffic: Traffic) -> Pose | Control | Sequence[float] | Sequence[Pose] | NDArray[Any]:
-        """The plan of the ego until the next step: 4 numbers are a :class:`Pose`, 2 a :class:`Control`.
+        """Return the plan of the ego until the next step: 4 numbers are a :class:`Pose`, 2 a :class:`Control`.
 
         Of several targets, a trajectory a step apart, the first is where the ego goes; then it is asked again.
         """
@@ -179,7 +179,7 @@ PIPE = "pipe:"
 
 
 def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
-    """A function that makes planners, one for each rollout.
+    """Return a function that makes planners, one for each rollout.
 
     Args:
         planner: a class with ``reset`` and ``plan``, a function that makes such objects, or a function from an
@@ -225,7 +225,7 @@ def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
 
 
 def named_planners(words: Sequence[str]) -> tuple[str, dict[int, str]]:
-    """The planner of the ego, empty for none, and of others by their ids, from such as ``idm`` and ``3=my.py:plan``.
+    """Return the planner of the ego, empty for none, and of others by their ids, from words such as ``3=my.py:plan``.
 
     Raises:
         ConfigError: two of one agent, or others' without one of the ego.
@@ -244,7 +244,7 @@ def named_planners(words: Sequence[str]) -> tuple[str, dict[int, str]]:
 
 
 def planner_name(planner: str | Callable[..., Any]) -> str:
-    """The name of a planner in records."""
+    """Return the name of a planner in records."""
     if isinstance(planner, str):
         return planner
     if isinstance(planner, partial):
@@ -262,7 +262,7 @@ def _needed(function: Callable[..., Any]) -> list[str]:
 
 
 def scenario_of(segment: RunSegment, ego: int, route: NDArray[Any], state: NDArray[Any], seed: int) -> Scenario:
-    """The scenario of an agent of a run segment, for a route [P, 2], its first state [4] and a seed."""
+    """Return the scenario of an agent of a run segment, for a route [P, 2], its first state [4] and a seed."""
     valid = segment.valid[ego]
     heading, velocity = segment.heading[ego].astype(np.float64), segment.velocity[ego].astype(np.float64)
     speed = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
@@ -289,7 +289,7 @@ def scenario_of(segment: RunSegment, ego: int, route: NDArray[Any], state: NDArr
 def traffic_of(
     segment: RunSegment, ego: int, step: int, state: Reals, now: Moment, past: Moments, route: Reals
 ) -> Traffic:
-    """What is seen from an agent's seat: its state [4], everyone now and before, and the route ahead [K, 2]."""
+    """Return the traffic that an agent sees: its state [4], all agents now and before, and the route ahead [K, 2]."""
     agents, (moves, there) = segment.num_agents, now
     before = [np.where(here[:, None], each, 0.0)[:agents] for each, here in past]
     moves, there = np.where(there[:, None], moves, 0.0)[:agents], there[:agents]
@@ -312,7 +312,7 @@ def traffic_of(
 
 
 def fixed(array: NDArray[Any]) -> NDArray[Any]:
-    """A view that can't be written to."""
+    """Return a view that can't be written to."""
     view = array.view()
     view.flags.writeable = False
     return view
@@ -327,10 +327,10 @@ def _fixed_road(road: RoadMap) -> RoadMap:
 
 
 def checked_plan(plan: Any, state: NDArray[Any], dt: float) -> Reals:
-    """The plan that a planner gave back as 2 or 4 finite numbers: of a trajectory, its first state.
+    """Return the plan of a planner as 2 or 4 finite numbers: of a trajectory, its first state.
 
     Args:
-        plan: as it came.
+        plan: as the planner returned it.
         state: [4] of the ego.
         dt: seconds.
 

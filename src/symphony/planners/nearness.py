@@ -1,4 +1,4 @@
-"""How near the ego is to a collision."""
+"""The nearness of the ego to a collision."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _HIT = "hit"
 
 
 class Nearness(TensorDictModuleBase):
-    """How near the ego is to running into somebody, were everyone to keep speed and course, as a value of states that
-    a search lowers. Once it has hit somebody it stays as near as can be; that is remembered in the state.
+    """The nearness of the ego to hitting another agent if all keep speed and course, as a value of states that a
+    search lowers. Once the ego has hit somebody it stays as near as can be; the state remembers that.
 
     Args:
         env: the environment.
@@ -41,11 +41,11 @@ class Nearness(TensorDictModuleBase):
         return tensordict.set(_HIT, (self.near(tensordict) >= 1.0).to(torch.float32)[..., None])
 
     def value(self, state: TensorDictBase) -> Float[Tensor, "*b"]:
-        """Minus how near, times the strength."""
+        """Return minus the nearness, times the strength."""
         return -self.strength * self.near(state)
 
     def near(self, state: TensorDictBase) -> Float[Tensor, "*b"]:
-        """From 0, nobody is near, to 1, the ego hits somebody who is not behind it, or has done so."""
+        """Return from 0 (nobody is near) to 1 (the ego hits somebody who is not behind it, or has done so)."""
         row = state.get(keys.SCENE).flatten()
         moves, valid = (state.get(key).flatten(0, state.ndim - 1) for key in (keys.STATE, keys.VALID))
         now = self.env.objects(row, state.get(keys.STEP).flatten(), moves, valid)

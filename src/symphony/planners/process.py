@@ -1,12 +1,12 @@
 """A planner in another process, in any language: JSON over its standard input and output, a line each.
 
 A process is started for every rollout. The first line it reads is ``{"reset": SCENE}``, every further one ``{"plan":
-NOW}``. It answers each with one line: ``reset`` with ``{}``, ``plan`` with ``{"step": STEP, "plan": PLAN}``: the
-step it was asked about, and ``[acceleration, steering]``, ``[x, y, heading, speed]``, or a list of such states.
-``{"error": "why"}`` ends the run, and so does whatever else it writes to its standard output: a line more than it
-was asked for, one of another step, or one of more than :data:`LONGEST` bytes. Its input ends when the rollout does;
-then, after :data:`GRACE` seconds, whatever is left of its process group is killed. What it writes to its standard
-error is shown.
+NOW}``. It answers each with one line: ``reset`` with ``{}``, ``plan`` with ``{"step": STEP, "plan": PLAN}``: the step
+it was asked about, and ``[acceleration, steering]``, ``[x, y, heading, speed]``, or a list of such states.
+``{"error": "why"}`` ends the run, and so does anything else it writes to its standard output: a line more than it was
+asked for, one of another step, or one of more than :data:`LONGEST` bytes. Its input ends when the rollout does; then,
+after :data:`GRACE` seconds, whatever is left of its process group is killed. What it writes to its standard error is
+shown.
 
 Of the environment it gets ``PATH``, ``HOME``, ``LANG``, names that begin with ``PYTHON``, and those that
 ``SYMPHONY_PLANNER_ENV`` names, separated by commas.
@@ -44,7 +44,7 @@ NAMES = "SYMPHONY_PLANNER_ENV"
 
 
 class ProcessPlanner:
-    """Asks a process of its own.
+    """A planner that asks a process of its own.
 
     Args:
         command: that starts it, as in a shell without its special characters.
@@ -81,7 +81,7 @@ class ProcessPlanner:
             raise ValueError(f"answered reset with {str(given)[:80]}, not with {{}}")
 
     def plan(self, traffic: Traffic) -> Any:
-        """The plan that the process answers."""
+        """Return the plan that the process answers."""
         seen = observation_of(self.scenario, traffic)
         now = {
             "time": seen.time,
@@ -138,7 +138,7 @@ class ProcessPlanner:
 
 
 def _plain(value: Any) -> Any:
-    """A record, an array or a number as JSON has it: null where it is not known."""
+    """Return a record, an array or a number as JSON has it: null where it is not known."""
     if hasattr(value, "_asdict"):
         return {name: _plain(part) for name, part in value._asdict().items()}
     if isinstance(value, tuple):
@@ -148,13 +148,13 @@ def _plain(value: Any) -> Any:
 
 
 def environment() -> dict[str, str]:
-    """The part of our environment that a planner's process gets: secrets in it are none of its business."""
+    """Return the part of our environment that a planner's process gets: it must not see secrets in the rest."""
     named = {"PATH", "HOME", "LANG", *os.environ.get(NAMES, "").replace(" ", "").split(",")}
     return {name: value for name, value in os.environ.items() if name in named or name.startswith("PYTHON")}
 
 
 def _end(process: subprocess.Popen[bytes]) -> int:
-    """The process is told that nothing more comes, and killed where it goes on, with all it started; its status."""
+    """Tell the process that nothing more comes, kill it and all it started where it goes on; return its status."""
     with contextlib.suppress(BrokenPipeError):
         if process.stdin is not None:
             process.stdin.close()

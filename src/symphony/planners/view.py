@@ -1,7 +1,7 @@
-"""Everything a planner sees in one record: for planners that are plain functions, and for those in other processes.
+"""The view of a planner in one record: for planners that are plain functions, and for those in other processes.
 
-World frame of the run segment, metres, seconds, m/s, radians counter-clockwise. Legend: M others that are there,
-K points, Q lights.
+World frame of the run segment, metres, seconds, m/s, radians counter-clockwise. Legend: M others that are present, K
+points, Q lights.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Ego(NamedTuple):
 
 
 class Agents(NamedTuple):
-    """Everyone else who is there, arrays [M]: box centres, headings, velocities, boxes, words for the types
+    """All other agents that are present, arrays [M]: box centres, headings, velocities, boxes, words for the types
     (``vehicle``, ``pedestrian``, ``cyclist``, ``other``, ``unset``), and ids that stay the same.
     """
 
@@ -49,7 +49,7 @@ class Agents(NamedTuple):
 
 class Lane(NamedTuple):
     """A lane: centre line [K, 2] in the direction of travel, limit, ids of the lanes that follow, that lead here, and
-    that a lane change may reach; its width and bounds [K, 2]. NaN is what is not known.
+    that a lane change may reach; its width and bounds [K, 2]. Unknown values are NaN.
     """
 
     id: int
@@ -76,7 +76,7 @@ class Lights(NamedTuple):
 
 
 class Before(NamedTuple):
-    """The ego and everyone else at an earlier step, at so many seconds since the start."""
+    """The ego and all others at an earlier step, at this many seconds since the start."""
 
     time: float
     ego: Ego
@@ -86,8 +86,8 @@ class Before(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class Observation:
     """The record that a planner sees at one step: seconds and steps since the start, seconds per step, the ego and
-    everyone else, points [K, 2] to follow from where the ego is (see :class:`~symphony.planners.interface.Traffic`;
-    may be empty), lanes, crosswalks (closed outlines [K, 2]) and lights of the map, the last seconds, the oldest step
+    all others, points [K, 2] to follow from where the ego is (see :class:`~symphony.planners.interface.Traffic`; may
+    be empty), lanes, crosswalks (closed outlines [K, 2]) and lights of the map, the last seconds, the oldest step
     first, the run segment's id and the seed of the rollout.
     """
 
@@ -106,7 +106,7 @@ class Observation:
 
 
 def lanes_of(scenario: Scenario) -> tuple[Lane, ...]:
-    """The lanes of a scenario."""
+    """Return the lanes of a scenario."""
     road, ids = scenario.road, scenario.road.lane_id.tolist()
     ways = (road.successors, road.successors[:, ::-1], road.left_neighbors, road.right_neighbors)
     linked = [{k: list[int]() for k in range(len(ids))} for _ in ways]
@@ -124,15 +124,15 @@ def lanes_of(scenario: Scenario) -> tuple[Lane, ...]:
 
 
 def crosswalks_of(scenario: Scenario) -> tuple[Reals, ...]:
-    """The outlines [K, 2] of crosswalks."""
+    """Return the outlines [K, 2] of crosswalks."""
     marks, kinds = scenario.road.marks, scenario.road.mark_type.tolist()
     walks = [marks[k][:, :2].astype(np.float64) for k, kind in enumerate(kinds) if kind == MarkType.CROSSWALK]
     return tuple(map(fixed, walks))
 
 
 def normals(line: Reals) -> Reals:
-    """[P, 2] to the left at each point, as long as keeps bounds at their distance at corners (at most 1.5); NaN for a
-    line of one place.
+    """Return [P, 2] vectors to the left at each point, long enough to keep bounds at their distance at corners (at
+    most 1.5); NaN for a line of one place.
     """
     new = np.concatenate([[True], (np.diff(line, axis=0) != 0).any(1)])
     if new.sum() < 2:
@@ -150,7 +150,7 @@ def normals(line: Reals) -> Reals:
 def observation_of(
     scenario: Scenario, traffic: Traffic, lanes: tuple[Lane, ...] = (), crosswalks: tuple[Reals, ...] = ()
 ) -> Observation:
-    """One record of what a planner is told at the start and what it observes now."""
+    """Return one record of what a planner is told at the start and what it observes now."""
     me, size, at = traffic.ego, scenario.size.tolist(), scenario.signal_point
 
     def others(moves: Reals, valid: NDArray[np.bool_]) -> Agents:
@@ -184,7 +184,7 @@ def observation_of(
 
 
 class FunctionPlanner:
-    """A planner that is a function of the observation alone; it remembers nothing, so copies are itself.
+    """A planner that is a function of the observation alone; it remembers nothing, so it is its own copy.
 
     Args:
         function: from an :class:`Observation` to a plan.
@@ -198,7 +198,7 @@ class FunctionPlanner:
         self.scenario, self.road = scenario, (lanes_of(scenario), crosswalks_of(scenario))
 
     def plan(self, traffic: Traffic) -> Any:
-        """The plan that the function gives."""
+        """Return the plan that the function gives."""
         return self.function(observation_of(self.scenario, traffic, *self.road))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> FunctionPlanner:
