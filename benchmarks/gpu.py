@@ -1,4 +1,4 @@
-"""What a graphics card makes of it: the paper's update, its search, and rollouts of very many branches.
+"""Measure a graphics card: the paper's update, its search, and rollouts of very many branches.
 
     python benchmarks/gpu.py [--branches 10000] [--device cuda] [--compiled]
 
@@ -32,7 +32,7 @@ PAPER = 16  # branches of a search when it is evaluated (paper, section V-A)
 
 
 def seconds(work: Callable[[], Any], device: torch.device, rounds: int) -> tuple[float, float]:
-    """The quickest of some rounds after one that doesn't count, and the peak of memory in MiB."""
+    """Return the quickest of some rounds after one that doesn't count, and the peak of memory in MiB."""
 
     def waited() -> float:
         if device.type == "cuda":
@@ -53,7 +53,7 @@ def seconds(work: Callable[[], Any], device: torch.device, rounds: int) -> tuple
 
 
 def main() -> None:
-    """Print a line for each."""
+    """Print a line for each measurement."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--branches", type=int, default=10_000, help="the most, over all scenes")

@@ -1,9 +1,9 @@
-"""How many operators a step of a search and an update start on a device, where each is a launch that the host makes.
+"""Count the operators that a step of a search and an update start on a device, each a launch by the host.
 
     python benchmarks/launches.py
 
-Counted on the CPU along the code that devices run, where nothing looks at numbers; views are no launches. What is
-compiled counts as one.
+Counted on the CPU along the code that devices run, where nothing looks at numbers; views are not launches. A compiled
+program counts as one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ METHODS = ("bc", "bc_h", "mgail_h")
 
 
 class Launches(TorchDispatchMode):
-    """Counts operators that compute something, by the part of the program that is at work."""
+    """Counts operators that compute something, by the running part of the program."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class Launches(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
     def program(self, step: Callable[..., Any]) -> Callable[..., Any]:
-        """A compiled function that counts one each time it runs."""
+        """Return a compiled function that counts one each time it runs."""
 
         def run(*args: Any) -> Any:
             self.counts["compiled step"] += 1
@@ -58,7 +58,7 @@ class Launches(TorchDispatchMode):
         return run
 
     def of(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """A function whose operators count for a part."""
+        """Return a function whose operators count for a part."""
 
         @wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -77,7 +77,7 @@ def _elsewhere(_tensor: Any) -> bool:
 
 @contextmanager
 def as_on_a_device() -> Iterator[None]:
-    """Nothing of the package looks at numbers inside."""
+    """Keep the package from looking at numbers inside."""
     patches = [
         mock.patch.object(module, "on_host", _elsewhere)
         for name, module in list(sys.modules.items())
@@ -94,7 +94,7 @@ def as_on_a_device() -> Iterator[None]:
 
 @torch.no_grad()
 def of_a_search_step(scenes: int = 2, branches: int = 2, *, compiled: bool = False) -> Counter[str]:
-    """By part, rounded up, of an agent with goals, foresight and a discriminator."""
+    """Count the operators by part, rounded up, for an agent with goals, foresight and a discriminator."""
     spec = AgentSpec(
         action_space="bicycle",
         dt=0.2,
@@ -128,7 +128,7 @@ def of_a_search_step(scenes: int = 2, branches: int = 2, *, compiled: bool = Fal
 
 
 def of_an_update(method: str) -> int:
-    """Of an update without a search, its states drawn and its weights changed."""
+    """Count the operators of an update without a search: drawing states and changing weights."""
     once, _ = update(method, states=16, points=20)
     with as_on_a_device(), Launches() as launches:
         once()
@@ -136,7 +136,7 @@ def of_an_update(method: str) -> int:
 
 
 def main() -> None:
-    """Print them."""
+    """Print the counts."""
     step = of_a_search_step()
     parts = ", ".join(f"{part} {count}" for part, count in step.most_common())
     compiled = of_a_search_step(compiled=True).total()

@@ -1,6 +1,6 @@
 """Make the built-in data set with SUMO: ``python benchmarks/make_builtin.py``.
 
-Writes ``src/symphony/data/builtin/train`` and ``.../test`` anew and prints what is in them. The two share no road
+Writes ``src/symphony/data/builtin/train`` and ``.../test`` again and prints what is in them. The two share no road
 network: each network has a seed of its own. Needs the extra ``symphony-traffic[sumo]``.
 """
 
@@ -35,7 +35,7 @@ MAPS = 2
 
 @dataclass(frozen=True)
 class Split:
-    """What one of the two stores holds."""
+    """The contents of one of the two stores."""
 
     segments: int
     networks: tuple[tuple[str, int], ...]
@@ -63,7 +63,7 @@ SPLITS: dict[SplitName, Split] = {
 
 
 def choose(segments: list[RunSegment], count: int, rng: np.random.Generator) -> list[RunSegment]:
-    """Some of a network's segments, spread evenly over :data:`MAPS` of its maps."""
+    """Return some of a network's segments, spread evenly over :data:`MAPS` of its maps."""
     by_map: dict[int, list[RunSegment]] = {}
     for segment in segments:
         by_map.setdefault(id(segment.road), []).append(segment)
@@ -97,7 +97,7 @@ def make(name: SplitName, split: Split) -> tuple[int, Counter[str], float]:
 
 
 def describe(store: SegmentStore) -> dict[str, Any]:
-    """What the logged driving is like, and how far the paths of egos and partners are from a feasible route."""
+    """Return the quality of the logged driving, and how far paths of egos and partners are from a feasible route."""
     errors = [e for segment in store for e in _route_errors(segment, interactive_agents(segment, 2))]
     return {
         **measure(store),
@@ -106,7 +106,7 @@ def describe(store: SegmentStore) -> dict[str, Any]:
 
 
 def _route_errors(segment: RunSegment, pair: NDArray[np.int64]) -> list[float]:
-    """Metres between each logged path and the feasible route that fits it best."""
+    """Return the metres between each logged path and the feasible route that fits it best."""
     graph = LaneGraph(segment.road)
     errors = []
     for agent in pair:
@@ -117,7 +117,7 @@ def _route_errors(segment: RunSegment, pair: NDArray[np.int64]) -> list[float]:
 
 
 def main() -> None:
-    """Make both stores, or only describe those that are there."""
+    """Make both stores, or only describe existing ones."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--describe", action="store_true", help="only print what the stores hold")
     only_describe = parser.parse_args().describe

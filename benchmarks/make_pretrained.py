@@ -1,14 +1,14 @@
 """Make an agent that comes with the package from a run: ``python benchmarks/make_pretrained.py RUN NAME``.
 
-Writes ``src/symphony/pretrained/NAME`` anew: configuration, the weights of the checkpoint that is the run's agent,
-the evaluations that were given, and a model card made of these, ``card.json`` (which `symphony agents` prints) and
+Writes ``src/symphony/pretrained/NAME``: configuration, the weights of the checkpoint that is the run's agent, the
+evaluations that were given, and a model card made of these, ``card.json`` (which `symphony agents` prints) and
 ``README.md``. The same run and evaluations give the same bytes.
 
     symphony evaluate RUN --data town-small/test
     symphony evaluate RUN --data ngsim
     python benchmarks/make_pretrained.py RUN NAME --scores RUN/evaluations/{test,ngsim}-*.json
 
-Scores of an agent that is there already, on further data (the same data's are replaced):
+Scores of an existing agent on further data (the same data's are replaced):
 
     symphony evaluate pretrained:NAME --data ngsim --json ngsim.json
     python benchmarks/make_pretrained.py pretrained:NAME NAME --scores ngsim.json
@@ -46,7 +46,7 @@ SPLITS = ("train", "validation", "test")
 
 @dataclass(frozen=True)
 class Source:
-    """A run and what is known of it.
+    """A run and what is known about it.
 
     Attributes:
         config: as the run has it.
@@ -127,7 +127,7 @@ def make(
 
 
 def add_scores(name: str, scores: Sequence[Path], folder: Path = FOLDER) -> Path:
-    """Add evaluations to an agent that is there, or replace those on the same data, and renew its card.
+    """Add evaluations to an existing agent, or replace those on the same data, and renew its card.
 
     Args:
         name: of the agent.
@@ -162,17 +162,17 @@ def _keep(place: Path, name: str, record: dict[str, Any], step: int) -> None:
 
 
 def _in_order(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Those on standard sets first."""
+    """Return the records, those on standard sets first."""
     return sorted(records, key=lambda one: (_standard(one["data"]) is None, one["data"]["name"]))
 
 
 def read_run(folder: Path) -> TrainConfig:
-    """The configuration a run was started with."""
+    """Return the configuration a run was started with."""
     return read_json(TrainConfig, folder / "config.json")
 
 
 def without_paths(config: TrainConfig) -> TrainConfig:
-    """The configuration with names in place of paths of the machine it was used on."""
+    """Return the configuration with names in place of paths of the machine it was used on."""
     evaluated = config.validation
     if evaluated.data is not None:
         evaluated = replace(evaluated, data=Path(data_name(evaluated.data)))
@@ -191,7 +191,7 @@ def without_paths(config: TrainConfig) -> TrainConfig:
 
 
 def data_name(path: Path) -> str:
-    """A store's name: that of its folder, after the name of the set if it is a split of one."""
+    """Return a store's name: that of its folder, after the name of the set if it is a split of one."""
     parts = [part for part in path.parts if part not in ("/", ".", "..")]
     return "/".join(parts[-2:] if parts[-1] in SPLITS else parts[-1:])
 
@@ -206,7 +206,7 @@ def _checksum(data: Path) -> str:
 
 
 def _before(run: Path, config: TrainConfig) -> str:
-    """What a run started from, as far as the runs beside it tell."""
+    """Return what a run started from, as far as the runs beside it tell."""
     if config.warm_start is None:
         return ""
     name = config.warm_start.name.partition("@")[0]
@@ -250,7 +250,7 @@ def _check_scores(record: dict[str, Any], config: TrainConfig, step: int) -> Non
 
 
 def card_of(name: str, source: Source, config: TrainConfig, parameters: dict[str, int]) -> dict[str, Any]:
-    """The model card, as ``card.json`` has it.
+    """Return the model card, as ``card.json`` has it.
 
     Args:
         name: of the agent.
@@ -280,7 +280,7 @@ def card_of(name: str, source: Source, config: TrainConfig, parameters: dict[str
 
 
 def page(facts: dict[str, Any]) -> str:
-    """The model card as a page."""
+    """Return the model card as a page."""
     rows = ["| setting | value |", "| --- | --- |"]
     rows += [f"| {key} | {value} |" for key, value in facts["settings"].items()]
     parts = [
@@ -372,7 +372,7 @@ def _settings(config: TrainConfig, spec: AgentSpec, parameters: dict[str, int]) 
 
 
 def _scores_of(record: dict[str, Any]) -> dict[str, Any]:
-    """An evaluation as a card has it."""
+    """Return an evaluation as a card has it."""
     how, data = record["config"], record["data"]
     trees = "one search tree" if how["trees"] == 1 else f"{how['trees']} search trees"
     ways = {
@@ -396,7 +396,7 @@ def _scores_of(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _standard(data: dict[str, Any]) -> str | None:
-    """Name of the standard set that a store is, by its checksum."""
+    """Return the name of the standard set that a store is, by its checksum."""
     for preset, made in PRESETS.items():
         for split, checksum in made.checksums.items():
             if checksum == data["checksum"]:

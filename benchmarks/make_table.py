@@ -1,8 +1,8 @@
-"""The whole way to a table of the paper, small: ``python benchmarks/make_table.py --out out/table``.
+"""The whole way to a table of the paper, in small: ``python benchmarks/make_table.py --out out/table``.
 
-Runs the eight recipes on the run segments that come with the package and prints the table of what they score, some
-minutes in all. What it shows is that everything works; agents as small as these have hardly learned to drive. Every
-further argument goes to every recipe, such as ``--steps 1000 --rollouts 16``.
+Runs the eight recipes on the run segments that come with the package and prints the table of their scores, in some
+minutes. It shows that everything works; agents as small as these have hardly learned to drive. Every further argument
+goes to every recipe, such as ``--steps 1000 --rollouts 16``.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Measure every row of the report and keep what is found as JSON: ``make bench``, or
+"""Measure every row of the report and keep the results as JSON: ``make bench``, or
 
     python benchmarks/measure.py --out out/bench.json [--only "search*" ...] [--rounds 15]
 
-Each row is a process of its own, forked from this one, with one thread. Its rounds are told in CPU time, so that
+Each row is a process of its own, forked from this one, with one thread. Its rounds are given in CPU time, so that
 other programs on the machine count less, and a matrix product is timed before and after them: shares of its speed,
 and of that of the brute force, are what can be compared between machines. ``tables.py`` makes the report of the file.
 """
@@ -65,7 +65,7 @@ PREPARATION = {
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What is measured, and how.
+    """A measurement: the work and how it is measured.
 
     Args:
         work: makes a round of it.
@@ -141,13 +141,13 @@ START = {
 
 
 def rows() -> dict[str, Row]:
-    """All by name; those of curves are called after what grows, as in ``scenes B = 16``."""
+    """Return all rows by name; those of curves are called after what grows, as in ``scenes B = 16``."""
     found = {name: Row(work=work, **HOW[name]) for name, work in WORKLOADS.items()}
     return found | {f"{name} = {n}": row for name, curve in CURVES.items() for n, row in curve.items()}
 
 
 def located(path: str) -> tuple[Any, str]:
-    """The module or class that holds what ``module:name`` or ``module:Class.name`` names, and its name there."""
+    """Return the module or class that ``module:name`` or ``module:Class.name`` lies in, and its name there."""
     module, _, names = path.partition(":")
     *owners, name = names.split(".")
     return reduce(getattr, owners, importlib.import_module(module)), name
@@ -200,7 +200,7 @@ def densely(pool: Callable[..., Any], *sets: Any, mode: str = "") -> Any:
 
 
 def timed(work: Callable[[], Any]) -> dict[str, float]:
-    """CPU seconds and page faults of a round."""
+    """Return CPU seconds and page faults of a round."""
     faults, began = resource.getrusage(resource.RUSAGE_SELF).ru_minflt, time.process_time()
     work()
     seconds = time.process_time() - began
@@ -208,7 +208,7 @@ def timed(work: Callable[[], Any]) -> dict[str, float]:
 
 
 def measured(row: Row, rounds: int, *, tuned: bool) -> dict[str, Any]:
-    """Everything about a row; what counts operators and times parts comes last, as it costs time itself."""
+    """Return all of a row; what counts operators and times parts comes last, as it costs time itself."""
     if tuned:
         allocator.tune()
     product, operations = matmul()
@@ -251,7 +251,7 @@ def measured(row: Row, rounds: int, *, tuned: bool) -> dict[str, Any]:
 
 
 def start(program: str) -> float:
-    """CPU seconds of a program in a process of its own; the better of two, of which the first finds cold files."""
+    """Return CPU seconds of a program in its own process; the better of two, of which the first finds cold files."""
     found = []
     for _ in range(2):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -262,7 +262,7 @@ def start(program: str) -> float:
 
 
 def forked(function: Callable[[], Any]) -> Any:
-    """What a function returns in a process of its own, as JSON has it."""
+    """Return what a function returns in a process of its own, as JSON has it."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -285,7 +285,7 @@ def forked(function: Callable[[], Any]) -> Any:
 
 
 def machine() -> dict[str, Any]:
-    """What it was measured with."""
+    """Describe the machine and the versions of the measurement."""
     info = Path("/proc/cpuinfo")
     models = [line.partition(":")[2].strip() for line in info.read_text().splitlines() if "model name" in line]
     versions = {"symphony": __version__, "torch": torch.__version__, "python": platform.python_version()}

@@ -23,7 +23,7 @@ HORIZON, ROUNDS, CANDIDATES = 12, 4, 64
 
 
 class Plane(EnvBase):
-    """A state whose step is a function; the episode is over where it leaves its bounds."""
+    """A state whose step is a function; the episode ends where it leaves its bounds."""
 
     batch_locked = False
 
@@ -77,7 +77,7 @@ class Pole(Plane):
 
 
 def planner(kind: str, env: EnvBase) -> Any:
-    """A policy by name; None for random actions."""
+    """Return a policy by name; None for random actions."""
     if kind == "CEM":
         return CEMPlanner(env, HORIZON, ROUNDS, CANDIDATES, 8)
     if kind == "MPPI":

@@ -1,7 +1,7 @@
 """PPO and SAC, TorchRL's own, on logged driving: python benchmarks/reinforcement.py; some ten minutes of a core.
 
 The ego of each built-in scene is driven along its logged route and paid for its metres, until it collides or leaves
-the road. Each run leaves a file in ``out/reinforcement``, and is not repeated where it has; together they become
+the road. Each run leaves a file in ``out/reinforcement`` and is not repeated if that exists; together they become
 ``results/reinforcement.json``, the table of docs/reinforcement.md.
 """
 
@@ -57,27 +57,27 @@ ENDS = {name: ("agents", name) for name in ("done", "terminated")}
 
 
 def progress(before: TensorDictBase, after: TensorDictBase) -> Tensor:
-    """Reward [*b, N] of a step: 1 for every 50 metres, and -1 for a collision or for leaving the road."""
+    """Return the reward [*b, N] of a step: 1 for every 50 metres, and -1 for a collision or for leaving the road."""
     moved = (after[keys.STATE] - before[keys.STATE])[..., :2].norm(dim=-1)
     return moved / 50 - (after[keys.COLLISION] | after[keys.OFFROAD]).squeeze(-1).float()
 
 
 def environment(split: str, dynamics: Bicycle | Displacement) -> DrivingEnv:
-    """All built-in scenes of a split, the ego of each interactive."""
+    """Return all built-in scenes of a split, the ego of each interactive."""
     data = SceneDataset(SegmentStore(builtin_store(split)), 1, dynamics, routes=True)
     scenes = data.scenes(range(len(data)))
     return DrivingEnv(scenes, dynamics, SEES, reward=progress, ends_on=("collision", "offroad"), seed=0)
 
 
 def per_agent(batch: TensorDictBase) -> TensorDictBase:
-    """A batch with ends of episodes in the shape of the reward, as TorchRL's losses want them."""
+    """Return a batch with ends of episodes in the shape of the reward, as TorchRL's losses want them."""
     for name, key in ENDS.items():
         batch["next", *key] = batch["next", name].unsqueeze(-2)
     return batch
 
 
 class Values(nn.Module):
-    """Values [..., N, 1] of what agents observe and, where that is given, do."""
+    """Computes values [..., N, 1] of what agents observe and, where that is given, do."""
 
     def __init__(self, action: int) -> None:
         super().__init__()
@@ -89,13 +89,13 @@ class Values(nn.Module):
 
 
 def critic(name: str, *action: keys.Key) -> TensorDictModule:
-    """A network of values under ``("agents", name)``."""
+    """Return a network of values under ``("agents", name)``."""
     seen = [*OWN, keys.OBJECTS, keys.ALONG, *action]
     return TensorDictModule(Values(2 * len(action)), seen, [("agents", name)])
 
 
 def reached(pedals: Tensor, state: Tensor) -> Tensor:
-    """Displacements [..., N, 2] from how much vehicles accelerate (up to 4 m/s²) and steer, from -1 to 1."""
+    """Return displacements [..., N, 2] from how much vehicles accelerate (up to 4 m/s²) and steer, from -1 to 1."""
     speed = state[..., 3]
     forward = (0.2 * speed + 0.16 * pedals[..., 0]).clamp_min(0.0)
     slope = 0.3 / (1.0 + (0.036 * speed.square()).square()).sqrt()  # 6 m/s² to the side
@@ -103,7 +103,7 @@ def reached(pedals: Tensor, state: Tensor) -> Tensor:
 
 
 def driven(policy: Callable[..., TensorDictBase], env: DrivingEnv) -> tuple[float, int]:
-    """Metres that the egos of all scenes drive until they crash or the log ends, and how many crash."""
+    """Return the metres that the egos of all scenes drive until they crash or the log ends, and how many crash."""
     start = env.with_goals(env.start(torch.arange(len(env.scenes))))
     found = simulate(env, policy, start)
     crashed = ((found.collision | found.offroad) & found.counted).squeeze(-1)
@@ -113,7 +113,7 @@ def driven(policy: Callable[..., TensorDictBase], env: DrivingEnv) -> tuple[floa
 
 
 def ppo(env: DrivingEnv) -> tuple[nn.Module, Callable[[TensorDictBase], None]]:
-    """A policy over the bicycle's actions, and what learns from a batch."""
+    """Return a policy over the bicycle's actions, and a function that learns from a batch."""
     actor = discrete_policy(FEATURES, OTHERS, hidden=32, head=(64,), own_keys=OWN, return_log_prob=True)
     values = critic("state_value")
     loss = ClipPPOLoss(actor, values, entropy_coeff=0.003, normalize_advantage=True)
@@ -135,7 +135,7 @@ def ppo(env: DrivingEnv) -> tuple[nn.Module, Callable[[TensorDictBase], None]]:
 
 
 def sac(env: DrivingEnv) -> tuple[nn.Module, Callable[[TensorDictBase], None]]:
-    """A policy over displacements that a vehicle can drive, and what learns from a batch and those before."""
+    """Return a policy over displacements that a vehicle can drive, and a function that learns from past batches."""
     network = SceneNetwork(SceneEncoder(FEATURES, [OTHERS[0].features], hidden=32), 4, head=(64,))
     seen = scene_module(network, OTHERS, ("agents", "head"), own_keys=OWN)
     where = [("agents", name) for name in ("loc", "scale")]
@@ -157,7 +157,7 @@ def sac(env: DrivingEnv) -> tuple[nn.Module, Callable[[TensorDictBase], None]]:
 
 
 def step(loss: LossModule, batch: TensorDictBase, optimizer: torch.optim.Optimizer) -> None:
-    """One update."""
+    """Make one update."""
     optimizer.zero_grad()
     sum(value for name, value in loss(batch).items() if name.startswith("loss")).backward()
     nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
@@ -165,7 +165,7 @@ def step(loss: LossModule, batch: TensorDictBase, optimizer: torch.optim.Optimiz
 
 
 def run(method: str, seed: int, batches: int = BATCHES) -> dict[str, Any]:
-    """Learn; metres driven and crashes in each batch, and in the scenes that were not learned from."""
+    """Learn; return metres driven and crashes in each batch, and in the scenes that were not learned from."""
     torch.manual_seed(seed)
     env = environment("train", Bicycle() if method == "ppo" else Displacement())
     env.set_seed(seed)
@@ -182,12 +182,12 @@ def run(method: str, seed: int, batches: int = BATCHES) -> dict[str, Any]:
 
 
 def per_crash(metres: float, crashes: int) -> float:
-    """Metres per crash; where none crashed, all of them."""
+    """Return metres per crash; where none crashed, all of them."""
     return metres / max(1, crashes)
 
 
 def record(runs: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
-    """What ``benchmarks/results_page.py`` makes a table of: means and their standard errors over seeds."""
+    """Return the record of ``benchmarks/results_page.py``: means and their standard errors over seeds."""
 
     def over_seeds(values: Sequence[float]) -> list[float]:
         spread = torch.tensor(values, dtype=torch.float64)
@@ -232,7 +232,7 @@ def curves(runs: dict[str, list[dict[str, Any]]], path: Path) -> None:
 
 
 def main() -> None:
-    """Do the runs that are not there yet, write the record, and draw the curves."""
+    """Do the missing runs, write the record, and draw the curves."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs=2, metavar=("METHOD", "SEED"), help="one run, without the record")
     only = parser.parse_args().only

@@ -1,4 +1,4 @@
-"""Which of the paper's relations between the methods hold in some evaluated runs, with paired errors:
+"""Check which of the paper's relations between the methods hold in some evaluated runs, with paired errors:
 
     python benchmarks/relations.py RUN ... [--setting main] [--evaluation NAME ...] [--json FILE]
     python benchmarks/relations.py RUN ... --paired METHOD      # every method less one of them instead
@@ -104,7 +104,7 @@ def relations(entries: Sequence[Entry], setting: Setting = "main") -> list[Relat
 
 
 def _check(one: Relation, before: Sequence[Entry], after: Sequence[Entry]) -> None:
-    """Fill in what was found."""
+    """Fill in the findings."""
     metric, does, sampled = one["metric"], one["does"], one["metric"] == "curvature_jsd"
     first, second = (float(np.mean([entry.number(metric) for entry in each])) for each in (before, after))
     if sampled:
@@ -165,7 +165,7 @@ def segment_rows(
 
 
 def paired_lines(entries: Sequence[Entry], base: str) -> list[str]:
-    """Say of every method how it differs from one of them, a line for each; seeds of a method are averaged first.
+    """Say how every method differs from one of them, a line for each; seeds of a method are averaged first.
 
     Raises:
         ConfigError: the base is not among them, one was simulated in several ways, or they share no segments.

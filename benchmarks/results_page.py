@@ -24,7 +24,7 @@ BLOCK = re.compile(r"(<!-- table ([a-z-]+) -->\n)(.*?)(<!-- end table -->)", re.
 
 
 def cell(value: Any, digits: int = 0) -> str:
-    """A value of a record as a table has it: text, a number, or a mean ± its standard error."""
+    """Return a value of a record as a table has it: text, a number, or a mean ± its standard error."""
     if isinstance(value, str):
         return value
     numbers = value if isinstance(value, list) else [value]
@@ -32,7 +32,7 @@ def cell(value: Any, digits: int = 0) -> str:
 
 
 def table(name: str) -> str:
-    """The table of a record in Markdown.
+    """Return the table of a record in Markdown.
 
     Raises:
         FileNotFoundError: there is no such record.
@@ -47,7 +47,7 @@ def table(name: str) -> str:
 
 
 def rewritten(text: str) -> str:
-    """A page with every table made anew.
+    """Return a page with every table written again.
 
     Raises:
         FileNotFoundError: a block names no record.

@@ -1,4 +1,4 @@
-"""Whether two versions simulate the same: searches on built-in segments, compared bit by bit.
+"""Check that two versions simulate the same: searches on built-in segments, compared bit by bit.
 
     python benchmarks/same_states.py --before 9eed275
 
@@ -21,7 +21,7 @@ from workloads import search
 
 
 def save(path: Path) -> None:
-    """Simulate with the version that is found, and save what came of it."""
+    """Simulate with the installed version, and save the result."""
     torch.set_num_threads(1)
     found = {}
     for points, features in ((128, "foresight"), (200, "clearance"), (1000, "paper")):

@@ -1,7 +1,6 @@
 """Draw what a search does to one run segment: ``python benchmarks/search_pictures.py --out docs/search.png``.
 
-Above are 16 branches of a tree that a rule prunes, below 16 lines that go back. What was simulated and given up is
-orange.
+Above are 16 branches of a tree that a rule prunes, below 16 lines that go back. Discarded simulations are orange.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ Copies = list[tuple[int, int, int]]
 
 
 def simulated(agent: Agent, segment: RunSegment, seed: int, *, back: bool) -> tuple[Steps, Copies]:
-    """All steps of a search of one run segment, a tree or lines that go back, and which branches were copied."""
+    """Return all steps of a search of one run segment, a tree or lines that go back, and the copied branches."""
     scenes = collate([scene(segment, interactive_agents(segment, 2).tolist(), LaneGraph(segment.road))])
     env = DrivingEnv(scenes, agent.dynamics, agent.observation)
     trees, branches = (BRANCHES, 1) if back else (1, BRANCHES)
@@ -123,7 +122,7 @@ def draw_over_time(axes: Axes, steps: Steps, copies: Copies, dt: float, title: s
 
 
 def draw_on_map(axes: Axes, steps: Steps, segment: RunSegment) -> None:
-    """Where both agents were in every step."""
+    """Draw where both agents were in every step."""
     view = view_around(np.concatenate([place for *_, place in steps]), margin=8.0, least=40.0)
     draw_roads(axes, segment.road, view)
     for color, size, wanted in ((KEPT, 1.2, True), (LOST, 1.6, False)):
@@ -135,7 +134,7 @@ def draw_on_map(axes: Axes, steps: Steps, segment: RunSegment) -> None:
 
 
 def main() -> None:
-    """Draw."""
+    """Draw the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="picture to write")
     parser.add_argument("--agent", default="pretrained:bc_ts_h", help="agent that drives")

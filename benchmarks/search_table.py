@@ -1,9 +1,9 @@
-"""Simulate the included agent by each way to search, and print what each gives and costs as a table.
+"""Simulate the included agent by each way to search, and print gain and cost of each as a table.
 
     python benchmarks/search_table.py --data DIR --out FOLDER      # FOLDER keeps a record of every evaluation
 
 ``DIR`` holds the stores ``town-small/test`` (of which the first 130 segments are taken) and ``ngsim-test``; the
-included test segments are taken, too. Evaluations whose records are there are not made again.
+included test segments are taken, too. Evaluations whose records exist are not made again.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ FIGURES = {
 
 
 def along_log(scenes: SceneBatch, rollouts: Rollouts) -> Float[Tensor, "B K"]:
-    """[B, K] 1 where every agent that the log moves by 5 m stays within 3 m of its logged path or straight on from
-    it; NaN where there is none.
+    """Return [B, K] 1 where every agent that the log moves by 5 m stays within 3 m of its logged path or straight on
+    from it; NaN where there is none.
     """
     log, there = logged(scenes)
     found = torch.full(rollouts.state.shape[:2], torch.nan)
@@ -63,7 +63,7 @@ def along_log(scenes: SceneBatch, rollouts: Rollouts) -> Float[Tensor, "B K"]:
 
 
 def some_along_log(scenes: SceneBatch, rollouts: Rollouts) -> Float[Tensor, "B K"]:
-    """[B, K] 1 where :func:`along_log` holds for any of the rollouts of the scene."""
+    """Return [B, K] 1 where :func:`along_log` holds for any of the rollouts of the scene."""
     each = along_log(scenes, rollouts)
     return each.amax(1, keepdim=True).expand(each.shape)
 
@@ -72,7 +72,7 @@ METRICS = tuple(f"{Path(__file__)}:{metric.__name__}" for metric in (along_log, 
 
 
 def record(data: Path, out: Path, store: str, way: str) -> dict[str, Any]:
-    """The numbers of an evaluation, and what it cost."""
+    """Return the numbers of an evaluation, and what it cost."""
     file = out / f"{store} {way}.json".replace(" ", "-").replace(",", "")
     if not file.exists():
         place, count = STORES[store]
@@ -88,7 +88,7 @@ def record(data: Path, out: Path, store: str, way: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Make what is not there, then the table, a row for each way and store."""
+    """Make what is missing, then the table, a row for each way and store."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)

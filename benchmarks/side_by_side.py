@@ -2,8 +2,8 @@
 
     python benchmarks/side_by_side.py --before 9eed275 [--rounds 15] [--only simulator ...]
 
-Each figure is the median over rounds in which the versions take turns, each in a process of its own, so that whatever
-else the machine does meets all of them. The version before is checked out beside this one by ``git worktree``.
+Each figure is the median over rounds in which the versions take turns, each in a process of its own, so that other
+load on the machine affects all of them. The version before is checked out beside this one by ``git worktree``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ YARDSTICKS = ("brute force", "matmul")
 
 
 def started(root: Path, program: str, *options: str) -> subprocess.Popen[str]:
-    """A program of this folder with the package of one version."""
+    """Start a program of this folder with the package of one version."""
     paths = os.pathsep.join([str(root / "src"), str(ROOT / "tests")])
     environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
     command = [sys.executable, str(ROOT / "benchmarks" / program), *options]
@@ -33,7 +33,7 @@ def started(root: Path, program: str, *options: str) -> subprocess.Popen[str]:
 
 
 def run(root: Path, program: str, *options: str) -> str:
-    """What a program prints."""
+    """Return what a program prints."""
     process = started(root, program, *options)
     printed, _ = process.communicate()
     if process.returncode:
@@ -55,14 +55,14 @@ class Worker:
         return line
 
     def measure(self) -> dict[str, float]:
-        """One round."""
+        """Measure one round."""
         assert self.process.stdin is not None
         self.process.stdin.write("\n")
         self.process.stdin.flush()
         return json.loads(self._line())
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         self.process.communicate()
 
 
@@ -83,7 +83,7 @@ def main() -> None:
 
 @contextmanager
 def checked_out(commit: str) -> Iterator[Path]:
-    """The files of a commit in a folder of their own."""
+    """Check out the files of a commit into a folder of their own."""
     with tempfile.TemporaryDirectory() as folder:
         old = Path(folder) / "before"
         git = ["git", "-C", str(ROOT), "worktree"]
@@ -100,7 +100,7 @@ WAYS = {"before": (), "after": (), "before kept": ("--keep-memory",), "after kep
 
 
 def report(old: Path, names: list[str], rounds: int) -> None:
-    """Measure and print."""
+    """Measure and print the table."""
     from measure import HOW, Row  # noqa: PLC0415
 
     print(HEADER, flush=True)
@@ -122,7 +122,7 @@ def report(old: Path, names: list[str], rounds: int) -> None:
 
 
 def row(name: str, found: dict[str, list[dict[str, float]]]) -> str:
-    """A line of the table."""
+    """Return a line of the table."""
 
     def middle(way: str, what: str) -> float:
         return statistics.median(one[what] for one in found[way])

@@ -19,35 +19,35 @@ REPORT = Path(__file__).resolve().parent / "reports" / "measure.md"
 
 
 def table(head: Iterable[str], lines: Iterable[Iterable[str]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     head = list(head)
     return "\n".join("| " + " | ".join(line) + " |" for line in [head, ["---"] * len(head), *lines]) + "\n"
 
 
 def rate(row: Row) -> float:
-    """Units a second."""
+    """Return units a second."""
     return float(row["units"] / row["seconds"])
 
 
 def spread(row: Row) -> str:
-    """Half the distance of the quartiles, of the median."""
+    """Return half the distance of the quartiles, relative to the median."""
     low, high = row["quartiles"]
     return f"{50 * (high - low) / row['seconds']:.0f} %"
 
 
 def share(row: Row, operations: str) -> str:
-    """Of the speed of the matrix product."""
+    """Return the share of the speed of the matrix product."""
     found = row.get(operations, 0)  # reports of before have fewer
     return f"{100 * found / row['seconds'] / row['matmul']:.0f} %" if found else ""
 
 
 def per_product(row: Row) -> float:
-    """Units in the time of 10^9 operations of the matrix product."""
+    """Return units in the time of 10^9 operations of the matrix product."""
     return rate(row) / row["matmul"] * 1e9
 
 
 def speeds(found: Mapping[str, list[Row]], before: Mapping[str, list[Row]]) -> Iterator[list[str]]:
-    """A line for each row and setting of the allocator."""
+    """Yield a line for each row and setting of the allocator."""
     brute = rate(found["brute force"][-1]) if "brute force" in found else 0.0
     for name, runs in found.items():
         if " = " in name or name == "matmul":
@@ -87,7 +87,7 @@ HEAD = (
 
 
 def parts(found: Mapping[str, list[Row]]) -> Iterator[list[str]]:
-    """A line for each row whose parts are known, most expensive first."""
+    """Yield a line for each row whose parts are known, most expensive first."""
     for name, runs in found.items():
         row = runs[-1]
         if row["parts"]:
@@ -96,7 +96,7 @@ def parts(found: Mapping[str, list[Row]]) -> Iterator[list[str]]:
 
 
 def curves(found: Mapping[str, list[Row]]) -> Iterator[list[str]]:
-    """A line for each curve: milliseconds of a round and its peak of memory, as one number grows."""
+    """Yield a line for each curve: milliseconds of a round and its peak of memory, as one number grows."""
     grown: dict[str, list[str]] = {}
     for name, (row, *_) in found.items():
         what, _, size = name.partition(" = ")
@@ -108,7 +108,7 @@ def curves(found: Mapping[str, list[Row]]) -> Iterator[list[str]]:
 
 
 def text(report: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> str:
-    """The whole report."""
+    """Return the whole report."""
     found, machine = report["rows"], report["machine"]
     old = {} if before is None else before["rows"]
     products = [row["matmul"] for runs in found.values() for row in runs]
@@ -140,7 +140,7 @@ CPU time, medians. `make bench` measures again, in {minutes}. A product of matri
 
 
 def main() -> None:
-    """Print or write."""
+    """Print or write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("report", type=Path)
     parser.add_argument("--before", type=Path)

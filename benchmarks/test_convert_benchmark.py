@@ -1,4 +1,4 @@
-"""How fast logs are converted, from the bytes of a file to the store.
+"""Measure how fast logs are converted, from the bytes of a file to the store.
 
 ``pytest benchmarks/test_convert_benchmark.py``; needs the real WOMD sample (see CONTRIBUTING.md), whose record is
 repeated under other names.

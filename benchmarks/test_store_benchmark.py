@@ -1,4 +1,4 @@
-"""How fast the store writes, opens and reads, and what a segment takes on disk.
+"""Measure how fast the store writes, opens and reads, and what a segment takes on disk.
 
 ``pytest benchmarks/test_store_benchmark.py`` (a map of its own per segment is the worst case: real logs without
 shared maps; a shared map is the built-in generator's case).
@@ -26,7 +26,7 @@ SEGMENTS = 100
 
 
 def scenario_size(shared_map: bool) -> list[RunSegment]:
-    """80 agents over 9 s at 5 Hz on 200 lanes with 12 000 map points: an ordinary WOMD scenario."""
+    """Return 80 agents over 9 s at 5 Hz on 200 lanes with 12 000 map points: an ordinary WOMD scenario."""
     rng = np.random.default_rng(0)
     base = random_segment("base", agents=80, steps=46, lanes=200, lights=12, marks=4)
 
@@ -72,7 +72,7 @@ def test_write(benchmark: Any, filled: Any, tmp_path: Path) -> None:
 
 
 def test_random_access(benchmark: Any, filled: Any) -> None:
-    """A segment's views, without touching its data."""
+    """Read a segment's views, without touching its data."""
     store = SegmentStore(filled[0])
     order = np.random.default_rng(0).permutation(SEGMENTS).tolist()
     benchmark(lambda: [store[i] for i in order])
@@ -80,7 +80,7 @@ def test_random_access(benchmark: Any, filled: Any) -> None:
 
 
 def test_read_everything(benchmark: Any, filled: Any) -> None:
-    """Every byte of agents and map copied out (from the page cache)."""
+    """Copy out every byte of agents and map (from the page cache)."""
     store = SegmentStore(filled[0])
 
     def copy() -> float:

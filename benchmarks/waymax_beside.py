@@ -2,11 +2,11 @@
 
     python benchmarks/waymax_beside.py [--steps 20] [--device cuda]
 
-The same scenes, with 2 000 road points each; on one core if the machine is told so (``taskset -c 0`` and
-``OMP_NUM_THREADS=1``). With ``--device cuda`` both are on the card (JAX must have been installed for it), and the
-time of a step is that on the wall until the card is done, not that of the CPU. Waymax comes from
-https://github.com/waymo-research/waymax; the ``waymax`` of the package index is another. First both take one step of
-0.1 s, and must find the same positions and overlaps.
+The same scenes, with 2 000 road points each; on one core if you say so (``taskset -c 0`` and ``OMP_NUM_THREADS=1``).
+With ``--device cuda`` both are on the card (JAX must have been installed for it), and the time of a step is that on
+the wall until the card is done, not that of the CPU. Waymax comes from https://github.com/waymo-research/waymax; the
+``waymax`` of the package index is another. First both take one step of 0.1 s, and must find the same positions and
+overlaps.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ except ImportError as error:
 
 
 def state_of(scenes: SceneBatch) -> Any:
-    """The scenes in Waymax's terms, all objects controlled, the first of each the ego."""
+    """Return the scenes in Waymax's terms, all objects controlled, the first of each the ego."""
     log = np.moveaxis(scenes.log_state.numpy(), 1, 2)  # [B, A, T, 5]
     shape, count = log.shape[:3], log.shape[:2]
 
@@ -100,7 +100,7 @@ def state_of(scenes: SceneBatch) -> Any:
 
 
 def waymax_step(scenes: SceneBatch) -> Callable[[], Any]:
-    """One compiled step of all scenes, with its flags."""
+    """Return one compiled step of all scenes, with its flags."""
     settings = dataclasses.replace(
         config.EnvironmentConfig(),
         max_num_objects=AGENTS,
@@ -122,7 +122,7 @@ def waymax_step(scenes: SceneBatch) -> Callable[[], Any]:
 
 
 def agree(scenes: SceneBatch, after: Any, flags: Any) -> None:
-    """Tell how far the first step of both is apart.
+    """Print how far apart the first steps of both are.
 
     Raises:
         SystemExit: beyond rounding.
@@ -141,7 +141,7 @@ def agree(scenes: SceneBatch, after: Any, flags: Any) -> None:
 
 
 def main() -> None:
-    """Whether both do the same, agent-steps a second of both, and their ratio."""
+    """Print whether both do the same, agent-steps a second of both, and their ratio."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")

@@ -1,4 +1,4 @@
-"""What is measured, in any version of the package: one round of work as a function, and how many agent-steps it is.
+"""The workloads measured in any version of the package: one round of work as a function, and its agent-steps.
 
 As a program it prepares one workload and answers each line of its input with a round's measurements as JSON;
 ``side_by_side.py`` asks two versions in turn.
@@ -50,7 +50,7 @@ SCENES, AGENTS, POINTS = 64, 32, 2000
 
 
 def ring(seed: int, agents: int = AGENTS, points: int = POINTS, steps: int = 11) -> SceneBatch:
-    """A ring road of 2 x 1 000 short boundary segments, each also a map point, all agents interactive."""
+    """Return a ring road of 2 x 1 000 short boundary segments, each also a map point, all agents interactive."""
     base, rng = scene(straight_road(3, steps=steps), [0, 1]), np.random.default_rng(seed)
     half, k = points // 2, np.arange(points // 2)
     angle = 2 * np.pi * k / half
@@ -97,7 +97,7 @@ def ring(seed: int, agents: int = AGENTS, points: int = POINTS, steps: int = 11)
 
 
 def step_of(scenes: SceneBatch, config: ObservationConfig, rows: Tensor, *, compiled: bool = False) -> Work:
-    """One step of the environment."""
+    """Return one step of the environment."""
     env = DrivingEnv(scenes, Bicycle(), config)
     if compiled:
         env.compile()
@@ -109,7 +109,7 @@ def step_of(scenes: SceneBatch, config: ObservationConfig, rows: Tensor, *, comp
 
 
 def rings(objects: int, points: int, *, count: int = SCENES, agents: int = AGENTS, device: str = "cpu") -> Work:
-    """All agents of some ring roads."""
+    """Return steps of all agents of some ring roads."""
     scenes = collate([ring(seed, agents) for seed in range(count)]).to(torch.device(device))
     if objects or points:
         config = ObservationConfig(num_objects=objects, num_points=points)
@@ -121,13 +121,13 @@ def rings(objects: int, points: int, *, count: int = SCENES, agents: int = AGENT
 
 
 def builtin(count: int, agents: int = 2) -> SceneBatch:
-    """Scenes of the built-in segments."""
+    """Return scenes of the built-in segments."""
     store = SegmentStore(builtin_store("train"))
     return collate([scene(store[k], agents) for k in range(count)])
 
 
 def smallest_step(*, compiled: bool = False) -> Work:
-    """One of two agents of one scene."""
+    """Return one step of two agents of one scene."""
     return step_of(builtin(1), ObservationConfig(16, 128), torch.arange(1), compiled=compiled)
 
 
@@ -138,7 +138,7 @@ GROUPS = (
 
 
 def actions_of_few() -> Work:
-    """What two agents of one scene do, by an untrained policy: beside the smallest step, what a planner waits for."""
+    """Return the actions of two agents by an untrained policy: with the smallest step, what a planner waits for."""
     start = DrivingEnv(builtin(1), Bicycle(), ObservationConfig(16, 128)).start(torch.arange(1))
     policy = discrete_policy(SELF_FEATURES, GROUPS)
     return lambda: policy(start.copy()), 2
@@ -153,10 +153,10 @@ def search(
     segments: int = 16,
     noise: bool = False,
 ) -> Work:
-    """A beam search on built-in segments with untrained networks.
+    """Return a beam search on built-in segments with untrained networks.
 
     Args:
-        points: nearest points that are seen.
+        points: nearest points that are observed.
         features: of the discriminator.
         branches: S.
         steps: T; the segments last 50.
@@ -199,7 +199,7 @@ def search(
 
 
 def update(method: str, *, states: int = 1024, points: int = 200, count: int = 1) -> Work:
-    """So many updates of a recipe on the built-in segments; one of every ten searches where there are searches."""
+    """Return ``count`` updates of a recipe on the built-in segments; one of every ten searches if it searches."""
     config = TrainConfig(
         method=method,
         data=builtin_store("train"),
@@ -220,7 +220,7 @@ def update(method: str, *, states: int = 1024, points: int = 200, count: int = 1
 
 
 def preparation(segments: int = 64) -> Work:
-    """Scenes, routes, lists and experts of built-in segments, from the store on; none is kept with that store."""
+    """Return the scenes, routes, lists and experts of built-in segments, from the store on; none is kept there."""
     store = SegmentStore(builtin_store("train"))
 
     def once() -> None:
@@ -232,14 +232,14 @@ def preparation(segments: int = 64) -> Work:
 
 
 def evaluation(segments: int = 64, rollouts: int = 16) -> Work:
-    """An agent that comes with the package on built-in segments, with its search."""
+    """Return an evaluation of an included agent on built-in segments, with its search."""
     agent, store = load_agent("pretrained:bc_ts_h"), SegmentStore(builtin_store("train"))
     config = EvaluateConfig(rollouts=rollouts)
     return lambda: evaluate(agent, store, config, items=range(segments)), segments
 
 
 def brute_force() -> Work:
-    """The simulator's step as a plain program: bicycle, all pairs of boxes, the nearest of all points."""
+    """Return the simulator's step as a plain program: bicycle, all pairs of boxes, the nearest of all points."""
     scenes, dynamics = collate([ring(seed) for seed in range(SCENES)]), Bicycle()
     state = torch.cat([scenes.log_state[:, 0, :, :3], torch.full((SCENES, AGENTS, 1), 8.0)], -1)
     action, size = torch.full((SCENES, AGENTS), 73), scenes.box_size
@@ -266,7 +266,7 @@ def brute_force() -> Work:
 
 
 def matmul() -> Work:
-    """A product of 2 048 x 2 048 matrices; its "agent-steps" are floating-point operations."""
+    """Return a product of 2 048 x 2 048 matrices; its "agent-steps" are floating-point operations."""
     a, b = torch.rand(2, 2048, 2048).unbind()
     return lambda: a @ b, 2 * 2048**3
 
@@ -293,7 +293,7 @@ if not any(map(shutil.which, ("c++", "g++", "clang++"))):
 
 
 class Measured:
-    """A workload, ready to be run.
+    """A workload, ready to run.
 
     Args:
         name: of the workload.
@@ -308,7 +308,7 @@ class Measured:
             self.work()
 
     def __call__(self) -> dict[str, float]:
-        """CPU seconds and page faults of a round, and MiB by which the peak rose above that of the prepared work."""
+        """Return CPU seconds and page faults of a round, and MiB by which the peak rose above the prepared work's."""
         faults, began = resource.getrusage(resource.RUSAGE_SELF).ru_minflt, time.process_time()
         self.work()
         seconds, after = time.process_time() - began, resource.getrusage(resource.RUSAGE_SELF)

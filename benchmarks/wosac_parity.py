@@ -1,4 +1,4 @@
-"""How far the WOSAC score is from the official one, over sets of rollouts whose official results are at hand.
+"""Measure how far the WOSAC score is from the official one, over rollouts whose official results are known.
 
     python benchmarks/wosac_parity.py --scenario FILE.tfrecord --official DIR --json results/wosac/parity.json
 
@@ -31,7 +31,7 @@ NAMES = {"min_ade": "min_average_displacement_error"}
 
 
 def feature_differences(found: WosacFeatures, file: Path) -> dict[str, float]:
-    """Largest difference of every feature; of flags, how many differ. NaN agrees with NaN."""
+    """Return the largest difference of every feature; of flags, how many differ. NaN agrees with NaN."""
     largest = {}
     with np.load(file, allow_pickle=False) as official:
         for prefix, part in (("log", found.log), ("sim", found.simulated)):
@@ -48,7 +48,7 @@ def feature_differences(found: WosacFeatures, file: Path) -> dict[str, float]:
 
 
 def compared(scenario: WosacScenario, file: Path, expected: dict[str, Any]) -> dict[str, Any]:
-    """One case: our scores, and the largest differences."""
+    """Return our scores of one case, and the largest differences."""
     found = compute_features(scenario, read_rollouts(file))
     result: dict[str, Any] = {"features": feature_differences(found, file)}
     for year, config in CHALLENGES.items():

@@ -1,11 +1,11 @@
-"""Wall time, CPU time and peak memory of the WOSAC score of one scenario.
+"""Measure wall time, CPU time and peak memory of the WOSAC score of one scenario.
 
     python benchmarks/wosac_score.py --scenario FILE.tfrecord --rollouts FILE.npz [--threads 1 2] [--repeat 5]
 
 A new process for every number of threads scores the scenario again and again: from the two files to all numbers. The
-first time, which fills caches, is given apart. A last row is the command `symphony wosac score` from its start to its
-end, Python's and PyTorch's imports included. Minimum and median; CPU seconds are what a busy machine changes least.
-The scorer itself uses one thread, whatever is allowed.
+first time, which fills caches, is listed separately. A last row is the command `symphony wosac score` from its start
+to its end, Python's and PyTorch's imports included. Minimum and median; CPU seconds are what a busy machine changes
+least. The scorer itself uses one thread, whatever is allowed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ UNIT = 1 if sys.platform == "darwin" else 1024
 
 
 def measured(threads: int, repeat: int, scenario: Path, rollouts: Path, config: str) -> dict[str, Any]:
-    """In a process of its own: seconds and CPU seconds of every time, and peak memory in bytes."""
+    """Measure in this process: seconds and CPU seconds of every time, and peak memory in bytes."""
     torch.set_num_threads(threads)
     times = []
     for _ in range(repeat + 1):
@@ -43,7 +43,7 @@ def measured(threads: int, repeat: int, scenario: Path, rollouts: Path, config: 
 
 
 def commanded(repeat: int, scenario: Path, rollouts: Path, config: str) -> dict[str, Any]:
-    """The same of the whole command."""
+    """Measure the whole command in the same way."""
     files = ["--scenario", str(scenario), "--rollouts", str(rollouts), "--config", config]
     command = [sys.executable, "-m", "symphony", "wosac", "score", *files]
     times, most = [], 0
@@ -59,18 +59,18 @@ def commanded(repeat: int, scenario: Path, rollouts: Path, config: str) -> dict[
 
 
 def peak() -> int:
-    """Peak memory of this process so far, bytes."""
+    """Return the peak memory of this process so far, bytes."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * UNIT
 
 
 def alone(function: Callable[..., dict[str, Any]], *args: Any) -> dict[str, Any]:
-    """Call it in a new process."""
+    """Call a function in a new process."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(function, args)
 
 
 def line(name: str, found: dict[str, Any]) -> str:
-    """One row of the table."""
+    """Return one row of the table."""
     (first, _), *rest = found["times"]
     wall, cpu = zip(*rest, strict=True)
     cells = [f"{min(values):.2f} / {statistics.median(values):.2f}" for values in (wall, cpu)]

@@ -1,8 +1,8 @@
-"""Encoders that attend to what is around an agent, beside the paper's, which pools it.
+"""Encoders that attend to an agent's surroundings, as alternatives to the paper's, which pools them.
 
 symphony train bc --data STORE --out runs/attending --agent.encoder attention:Everything
 
-`docs/ablations.md` says what they give. The folder of this file must be on PYTHONPATH, or the current one.
+`docs/ablations.md` says what they gain. The folder of this file must be on PYTHONPATH, or the current one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MANY = 48
 
 
 class Everything(nn.Module):
-    """An agent looks twice, the second time with what it has seen, at the encoded elements of every set around it."""
+    """An encoder with which an agent looks twice, the second time knowing the first, at all elements around it."""
 
     def __init__(self, own_features: int, group_features: list[int], *, hidden: int = 64):
         super().__init__()
@@ -31,7 +31,7 @@ class Everything(nn.Module):
         self.norm = nn.LayerNorm(hidden)
 
     def forward(self, own: Tensor, valid: Tensor, *elements_and_masks: Tensor) -> Tensor:
-        """Own features, mask, then elements [..., N, K, F] and mask of each group; gives [..., N, width]."""
+        """Encode own features under a mask, then elements [..., N, K, F] and mask of each group: [..., N, width]."""
         me = self.own(torch.where(valid[..., None], own, 0.0)).relu()
         pairs = zip(self.groups, elements_and_masks[::2], elements_and_masks[1::2], strict=True)
         encoded = [self.elements(encoder, e, mask & valid[..., None]) for encoder, e, mask in pairs]
@@ -42,11 +42,11 @@ class Everything(nn.Module):
         return seen.relu()
 
     def elements(self, encoder: nn.Module, elements: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Elements as they are attended to, [..., K, hidden], and their mask."""
+        """Return elements as they are attended to, [..., K, hidden], and their mask."""
         return self.norm(encoder(torch.where(mask[..., None], elements, 0.0))), mask
 
     def look(self, query: Tensor, elements: Tensor, mask: Tensor) -> Tensor:
-        """What a query [..., hidden] sees among elements: zeros where there is none."""
+        """Return what a query [..., hidden] sees among elements: zeros where there is none."""
         parts, queries = elements.unflatten(-1, (HEADS, -1)), query.unflatten(-1, (HEADS, -1))
         weights = torch.einsum("...khd,...hd->...kh", parts, queries) / parts.shape[-1] ** 0.5
         weights = weights.masked_fill(~mask[..., None], -1e4).softmax(-2) * mask[..., None]
@@ -54,7 +54,7 @@ class Everything(nn.Module):
 
 
 class Others(Everything):
-    """The same for small sets, others and lights, with keys and values of their own; map points are pooled."""
+    """The same encoder for small sets, others and lights, with their own keys and values; map points are pooled."""
 
     def __init__(self, own_features: int, group_features: list[int], *, hidden: int = 64):
         super().__init__(own_features, group_features, hidden=hidden)
@@ -62,14 +62,14 @@ class Others(Everything):
         self.both = dict(zip(self.groups, self.keys, strict=True))
 
     def elements(self, encoder: nn.Module, elements: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Keys and values [..., 2, K, hidden], or of large sets their maximum [..., hidden]; and the mask."""
+        """Return keys and values [..., 2, K, hidden], or of large sets their maximum [..., hidden]; and the mask."""
         if elements.shape[-2] > MANY:
             return pool_elements(encoder, elements, mask), mask
         encoded, _ = super().elements(encoder, elements, mask)
         return torch.stack(self.both[encoder](encoded).chunk(2, -1), -3), mask
 
     def look(self, query: Tensor, elements: Tensor, mask: Tensor) -> Tensor:
-        """What a query [..., hidden] sees among elements: zeros where there is none."""
+        """Return what a query [..., hidden] sees among elements: zeros where there is none."""
         if elements.ndim == query.ndim:
             return elements.relu()
         keys, values = elements.unflatten(-1, (HEADS, -1)).transpose(-2, -3).unbind(-4)  # [..., heads, K, d]

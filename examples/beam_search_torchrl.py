@@ -1,7 +1,7 @@
 """Beam search in a TorchRL environment that has nothing to do with driving: python examples/beam_search_torchrl.py
 
-A pendulum is pushed at random. Every 5 steps the half of the branches with the higher cost makes room for copies
-of the others: without learning anything, the search finds pushes that swing it up.
+A pendulum is pushed at random. Every 5 steps the half of the branches with the higher cost is replaced by copies of
+the others: without learning anything, the search finds pushes that swing it up.
 """
 
 from __future__ import annotations

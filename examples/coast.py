@@ -1,4 +1,4 @@
-"""The shortest planner there is, and one to compare others with: it keeps its speed and never turns.
+"""The shortest possible planner, and one to compare others with: it keeps its speed and never turns.
 
 symphony simulate pretrained:bc_ts_h --planner examples/coast.py:plan --data STORE --out sim
 """
@@ -7,5 +7,5 @@ from symphony.planners.view import Observation
 
 
 def plan(observation: Observation) -> tuple[float, float]:
-    """No acceleration, no steering."""
+    """Return no acceleration and no steering."""
     return 0.0, 0.0

@@ -23,15 +23,15 @@ STATE, STEPS = ["th", "thdot"], 100
 
 
 class Net(nn.Sequential):
-    """Layers upon angle and speed [*b]."""
+    """Layers on angle and speed [*b]."""
 
     def forward(self, angle: Tensor, speed: Tensor) -> Tensor:
-        """The outputs [*b, K]."""
+        """Return the outputs [*b, K]."""
         return super().forward(torch.stack([angle.cos(), angle.sin(), speed / 8], -1))
 
 
 def torques(loc: Tensor, scale: Tensor) -> Independent:
-    """Around at most 2, the most there is."""
+    """Return a normal distribution around torques of at most 2, the largest possible."""
     return Independent(Normal(2 * loc.tanh(), scale), 1)
 
 
@@ -45,7 +45,7 @@ def expert(td: TensorDictBase) -> TensorDictBase:
 
 @torch.no_grad()
 def drive(policy) -> TensorDictBase:
-    """Rollouts [64, T] of a policy."""
+    """Return rollouts [64, T] of a policy."""
     return with_rows(PendulumEnv(), [64]).rollout(STEPS, policy, break_when_any_done=False)
 
 

@@ -32,7 +32,7 @@ AGENT = "pretrained:bc_ts_h"
 
 
 def make_env(share: int, shares: int, rows: int) -> EnvBase:
-    """As many scenes at a time as there are rows, drawn from every so many-th segment of the store."""
+    """Build as many scenes at a time as there are rows, drawn from every ``shares``-th segment of the store."""
     agent, store = load_agent(AGENT), SegmentStore(builtin_store("train"))
     data = SceneDataset(store, agent.interactive, agent.dynamics, range(share, len(store), shares), routes=True)
     rng = torch.Generator().manual_seed(share)
@@ -40,7 +40,7 @@ def make_env(share: int, shares: int, rows: int) -> EnvBase:
 
 
 class Searches(BeamSearchCollector):
-    """A collector that makes what it needs where it is: environment, score, and the routes of its first states."""
+    """A collector that builds what it needs where it runs: environment, score, and the routes of its first states."""
 
     def __init__(self, create_env_fn: Any, policy: Any, **settings: Any) -> None:
         env = create_env_fn()
@@ -58,7 +58,7 @@ class Searches(BeamSearchCollector):
 
 
 def collected(workers: int, batches: int, rows: int, branches: int, steps: int) -> Iterator[TensorDictBase]:
-    """Batches of the best rollouts of searches, each of them from all workers."""
+    """Yield batches of the best rollouts of searches, each of them from all workers."""
     agent, frames = load_agent(AGENT), workers * rows * steps
     policy = TensorDictSequential(SeededNoise(0, agent.dynamics.numbers), agent.policy)
     collector = RayCollector(

@@ -1,4 +1,4 @@
-"""A planner of one's own as the ego, an included agent around it: python examples/planner.py
+"""Your own planner as the ego, with an included agent around it: python examples/planner.py
 
 The same by the command line, from this folder:
 symphony simulate pretrained:bc_ts_h --planner planner:Careful --data STORE --out sim
@@ -26,7 +26,7 @@ STOP = (SignalState.STOP, SignalState.ARROW_STOP)
 
 
 class Careful:
-    """Goes along its route, slower in bends, and brakes for red lights and for whoever is in its way."""
+    """Goes along its route, slower in bends, and brakes for red lights and for any agent in its way."""
 
     top_speed, braking, acceleration, sideways = 10.0, 3.0, 1.0, 2.0  # m/s and m/s^2
 
@@ -50,7 +50,7 @@ class Careful:
         self.light_at = np.where(away.min(1, initial=9.0) < 1.5, away.argmin(1) if away.size else 0, -1)
 
     def plan(self, traffic: Traffic) -> Pose:
-        """The next place on the route, at a speed from which it can still brake for all that lies ahead."""
+        """Return the next place on the route, at a speed from which it can still brake for all that lies ahead."""
         others = traffic.valid.copy()
         others[traffic.ego] = False
         ahead = np.linspace(4.0, max(8.0, 3.0 * self.speed), 12)
@@ -71,7 +71,7 @@ class Careful:
         return Pose(*here, heading, self.speed)
 
     def place(self, along: np.ndarray) -> np.ndarray:
-        """Points [N, 2] so many metres [N] from the start of the route, straight on past its end."""
+        """Return points [N, 2] at ``along`` metres [N] from the start of the route, straight on past its end."""
         last = (self.route[-1] - self.route[-2]) / (self.arc[-1] - self.arc[-2])
         points = np.stack([np.interp(along, self.arc, axis) for axis in self.route.T], -1)
         points = points + np.maximum(along - self.arc[-1], 0.0)[:, None] * last

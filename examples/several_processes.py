@@ -23,29 +23,29 @@ ROWS, STEPS = 16, 100
 
 
 def make_env() -> EnvBase:
-    """Sixteen pendulums."""
+    """Build sixteen pendulums."""
     return with_rows(PendulumEnv(), [ROWS])
 
 
 class Heads(nn.Sequential):
-    """Mean and spread of the torque from angle and speed [*b]."""
+    """Computes mean and spread of the torque from angle and speed [*b]."""
 
     def __init__(self) -> None:
         super().__init__(MLP(3, 2, num_cells=[64, 64]), NormalParamExtractor())
 
     def forward(self, angle: Tensor, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """Both [*b, 1]."""
+        """Return mean and spread, each [*b, 1]."""
         return super().forward(torch.stack([angle.cos(), angle.sin(), speed / 8], -1))
 
 
 def torques(loc: Tensor, scale: Tensor) -> Independent:
-    """Around at most 2, the most there is."""
+    """Return a normal distribution around torques of at most 2, the largest possible."""
     return Independent(Normal(2 * loc.tanh(), scale), 1)
 
 
 @torch.no_grad()
 def cost(actor: ProbabilisticActor) -> float:
-    """Mean cost per step of the policy alone."""
+    """Return the mean cost per step of the policy alone."""
     rewards = [make_env().rollout(STEPS, actor, break_when_any_done=False)["next", "reward"] for _ in range(4)]
     return -float(torch.stack(rewards).mean())
 

@@ -1,8 +1,8 @@
 """One recipe for each row of the paper's tables: networks, environment, collector, losses, the order of updates.
 
 A recipe is a function from a configuration to a trainer that is ready to run, meant to be read from top to bottom.
-Recipes repeat one another on purpose; nothing below this package knows which methods there are. In a checkout the
-files lie at the top, in ``recipes``, and each is a script, too.
+Recipes repeat one another on purpose; no other package knows the methods. In a checkout the files lie at the top, in
+``recipes``, and each is also a script.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Recipe = Callable[[TrainConfig, Processes], Trainer]
 
 
 def recipe_of(method: Method) -> Recipe:
-    """The recipe of a method: the function of its name, in the file of its name."""
+    """Return the recipe of a method: the function of its name, in the file of its name."""
     return getattr(importlib.import_module(f"symphony.recipes.{method}"), method)
 
 
@@ -47,7 +47,7 @@ def train(config: TrainConfig, recipe: Recipe | None = None) -> Path:
 
 
 def trainer_of(config: TrainConfig, world: Processes, recipe: Recipe | None = None) -> Trainer:
-    """The trainer that a recipe builds, with the hooks that its configuration asks for: validation and previews."""
+    """Return the trainer that a recipe builds, with the hooks that its configuration asks for."""
     trainer = (recipe or recipe_of(config.method))(config, world)
     if world.is_main and (config.validation.data is not None or 0 < config.preview.every <= config.steps):
         from symphony.training.hooks import add_hooks  # noqa: PLC0415 - loads what simulates, judges and draws

@@ -1,4 +1,4 @@
-"""Behavioural cloning with goals, and a policy gradient against collisions in closed loop: no row of the paper's.
+"""Behavioural cloning with goals, and a policy gradient against collisions in closed loop: not in the paper.
 
 Made for an agent that drives already (`--warm-start`). Nothing prunes its rollouts; the included agent had eight of
 each run segment (`--search.branches 8`).

@@ -1,4 +1,4 @@
-"""Random numbers: hashes of what they are for, so that a rollout is the same in any batch, process or device."""
+"""Random numbers as hashes of what they are for, so that a rollout is the same in any batch, process or device."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _GAMMA = 0x9E3779B97F4A7C15
 
 
 def _signed(value: int) -> int:
-    """The int64 with the low 64 bits of `value`."""
+    """Return the int64 with the low 64 bits of `value`."""
     return (value + (1 << 63)) % (1 << 64) - (1 << 63)
 
 
 def _mix(x: Int[Tensor, "*b"]) -> Int[Tensor, "*b"]:
-    """SplitMix64's finaliser, a bijection of int64 in which each input bit sways each output bit."""
+    """Apply SplitMix64's finaliser, a bijection of int64 in which each input bit sways each output bit."""
     for bits, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         # int64 shifts copy the sign; the mask makes the shift logical.
         x = (x ^ ((x >> bits) & ((1 << (64 - bits)) - 1))) * _signed(factor)

@@ -58,9 +58,9 @@ def plot_curves(
 ) -> Figure:
     """Draw the metrics of runs over their updates: pale as recorded, strong smoothed, one colour per run.
 
-    Given metrics have a panel each; by default there are all, related ones together, at most ``columns`` in a row. A
+    Given metrics have a panel each; by default all are drawn, related ones together, at most ``columns`` in a row. A
     point of the smoothed line is averaged over a share (``window``) of a run's records; 0 to not smooth. Raises a
-    :class:`ConfigError` for nothing to draw, a metric that no run has, a window out of range, or a file that is no
+    :class:`ConfigError` for nothing to draw, a metric that no run has, a window out of range, or a file that is not a
     png, pdf or svg.
     """
     file = picture_path(path)
@@ -100,7 +100,7 @@ def plot_curves(
 
 
 def read_curves(records: Records) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Updates [K] and values [K] of each metric; what is no number is left out, NaN is kept."""
+    """Return updates [K] and values [K] of each metric; what is not a number is left out, NaN is kept."""
     found: dict[str, tuple[list[float], list[float]]] = {}
     for record in records:
         for name, value in record.items():
@@ -113,7 +113,7 @@ def read_curves(records: Records) -> dict[str, tuple[NDArray[np.float64], NDArra
 
 
 def panels_of(present: Sequence[str]) -> dict[str, list[str]]:
-    """The metrics of each panel by its title, for the metrics there are: in their order, but for the last."""
+    """Return the metrics of each panel by its title, for the metrics that are present: in order, but for the last."""
     titles = {name: title for title, names in PANELS.items() for name in names}
     panels: dict[str, list[str]] = {}
     for name in sorted(present, key=lambda name: LAST.index(name) if name in LAST else -1):
@@ -123,7 +123,7 @@ def panels_of(present: Sequence[str]) -> dict[str, list[str]]:
 
 
 def smoothed(values: NDArray[np.float64], window: float) -> NDArray[np.float64]:
-    """Averages [K] of the finite among the values [K] around each, over a share of them all; NaN where none is."""
+    """Return averages [K] of the finite among values [K] around each, over a share of all; NaN if none is finite."""
     reach = round(window * len(values) / 2)
     if reach == 0:
         return np.where(np.isfinite(values), values, np.nan)
@@ -134,7 +134,7 @@ def smoothed(values: NDArray[np.float64], window: float) -> NDArray[np.float64]:
 
 
 def run_colors(count: int) -> list[str]:
-    """A colour for each run, all different."""
+    """Return a colour for each run, all different."""
     if count <= len(AGENT_COLORS):
         return list(AGENT_COLORS[:count])
     return [to_hex(color) for color in colormaps["turbo"](np.linspace(0.05, 0.95, count))]
@@ -189,7 +189,7 @@ def _style(axes: Axes, title: str) -> None:
 
 
 def _draw_curve(axes: Axes, steps: NDArray[Any], values: NDArray[Any], window: float, gid: str, **style: Any) -> None:
-    """A metric of a run, pale as recorded and strong smoothed."""
+    """Draw a metric of a run, pale as recorded and strong smoothed."""
     axes.plot(steps, values, linewidth=0.7, alpha=0.3, gid=f"raw-{gid}", **style)
     # A lone record has no line.
     marker = "o" if np.isfinite(values).sum() == 1 else ""

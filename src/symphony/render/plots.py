@@ -114,7 +114,7 @@ class Clip:
 
     @property
     def steps(self) -> slice:
-        """Steps of the log that the rollouts last."""
+        """The steps of the log that the rollouts cover."""
         return slice(self.start, self.start + self.heading.shape[2])
 
     @property
@@ -139,7 +139,7 @@ class Clip:
         return float(np.clip(2.5 / len(self.position), 0.3, 0.9))
 
     def words(self) -> str:
-        """Such as `16 rollouts, 3 distinct`: leaves of a search may share all of their history."""
+        """Return a summary such as `16 rollouts, 3 distinct`: leaves of a search may share all of their history."""
         known = self.valid[..., None]
         state = np.concatenate([self.position, self.heading[..., None]], -1)
         rows = np.concatenate([np.where(known, state, 0.0), known], -1).reshape(len(state), -1)
@@ -147,14 +147,14 @@ class Clip:
         return f"{count} rollout{'s' * (count > 1)}" + (f", {distinct} distinct" if distinct < count else "")
 
     def beginnings(self, name: str, until: int | None = None) -> NDArray[np.bool_]:
-        """[K, N, T] where each run of true steps of an event begins, up to a step."""
+        """Return [K, N, T] where each run of true steps of an event begins, up to a step."""
         happening = getattr(self, name) & self.valid
         begins = happening & ~np.pad(happening[..., :-1], ((0, 0), (0, 0), (1, 0)))
         return begins if until is None else begins & (np.arange(begins.shape[-1]) <= until)
 
 
 def saved_clip(saved: SavedRollouts, count: int | None = None, title: str | None = None) -> Clip:
-    """The first so many of the saved rollouts of a run segment, all by default, to be drawn or animated."""
+    """Return the first ``count`` rollouts of a run segment, all by default, to be drawn or animated."""
     # The first state is the log's.
     state = saved.state[:count, 1:].swapaxes(1, 2)
     valid, collision, offroad = (
@@ -235,10 +235,10 @@ def plot_routes(segment: RunSegment, agent: int, lines: Sequence[NDArray[Any]], 
 def plot_grid(
     panels: Sequence[Callable[[Axes], Any]], path: str | Path, *, columns: int = 3, size: float = 4.5
 ) -> Figure:
-    """Several pictures in one file (png, pdf or svg; a :class:`ConfigError` for another).
+    """Draw several pictures in one file (png, pdf or svg; a :class:`ConfigError` for another).
 
     Panels are functions that draw on the axes they are given, such as ``lambda axes: plot_segment(segment, axes)``,
-    on so many inches; there are at most ``columns`` in a row.
+    of a ``size`` in inches; there are at most ``columns`` in a row.
     """
     file = picture_path(path)
     figure, slots = new_panels(len(panels), min(columns, len(panels)), size, size)
@@ -249,7 +249,7 @@ def plot_grid(
 
 
 def _own_view(trails: NDArray[Any], target: Target) -> View:
-    """Around trails [P, 2]; a square where it is one panel among others, so that all are of one size."""
+    """Return the view around trails [P, 2]; a square for one panel among others, so that all are of one size."""
     view = view_around(trails)
     return with_aspect(view) if isinstance(target, Axes) else view
 
@@ -286,7 +286,7 @@ def draw_events(
 
 
 def draw_hit(axes: Axes, clip: Clip) -> Patch | None:
-    """Outline the playback agents that were hit, where they were when it began; gives a legend entry if any."""
+    """Outline the playback agents that were hit, where they were when it began; return a legend entry if any."""
     segment = clip.segment
     found: set[tuple[int, int]] = set()
     for rollout, rank, at in np.argwhere(clip.beginnings("collision")).tolist():
@@ -307,7 +307,7 @@ def draw_hit(axes: Axes, clip: Clip) -> Patch | None:
 
 
 def draw_playback(axes: Axes, segment: RunSegment, step: int, agents: NDArray[Any]) -> None:
-    """Draw those of the agents [K] that are seen at a step, in grey."""
+    """Draw those of the agents [K] that are valid at a step, in grey."""
     shown = agents[segment.valid[agents, step]]
     if len(shown):
         at = segment.position[shown, step, :2], segment.heading[shown, step], segment.size[shown]
@@ -315,13 +315,13 @@ def draw_playback(axes: Axes, segment: RunSegment, step: int, agents: NDArray[An
 
 
 def colors_of(segment: RunSegment, agents: Any) -> list[str]:
-    """A colour for each agent: the ego's is the same in every picture."""
+    """Return a colour for each agent: the ego's is the same in every picture."""
     others = [int(agent) for agent in agents if agent != segment.ego]
     return [agent_color(0 if agent == segment.ego else 1 + others.index(int(agent))) for agent in agents]
 
 
 def describe(segment: RunSegment) -> str:
-    """Source, duration, rate and agents of a segment, for a caption."""
+    """Return source, duration, rate and number of agents of a segment, for a caption."""
     duration = (segment.log_steps - 1) * segment.dt
     rate, agents = f"{1 / segment.dt:g} Hz", f"{segment.num_agents} agents"
     rate += " of log" * (segment.logged > 0)
@@ -329,7 +329,7 @@ def describe(segment: RunSegment) -> str:
 
 
 def agent_entries(segment: RunSegment, agents: Any) -> list[Patch]:
-    """Legend entries of agents in colour, of a crowd the first :data:`ENTRIES`."""
+    """Return legend entries of the coloured agents, of a crowd the first :data:`ENTRIES`."""
 
     def label(agent: int) -> str:
         role = "ego" if agent == segment.ego else "interactive"
@@ -343,5 +343,5 @@ def agent_entries(segment: RunSegment, agents: Any) -> list[Patch]:
 
 
 def playback_entry(label: str = "playback") -> Patch:
-    """Legend entry of the agents in grey."""
+    """Return the legend entry of the agents in grey."""
     return Patch(color=PLAYBACK, label=label)

@@ -56,7 +56,7 @@ LEAD = 2.0  # seconds before the first event of a run at which its replay begins
 
 
 def report_page(found: Mapping[str, Any], viewer: str | None = "view.html") -> str:
-    """One self-contained page of what the report writes; ``viewer`` is the address of the page that plays the
+    """Return one self-contained page of what the report writes; ``viewer`` is the address of the page that plays the
     rollouts, relative to this one, None for none.
     """
     runs = found["per_run"]
@@ -119,7 +119,7 @@ def _collisions(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _run(row: Mapping[str, Any], viewer: str | None) -> dict[str, Any]:
-    """What the table shows of a run."""
+    """Return what the table shows of a run."""
     shown: dict[str, Any] = {
         name: round(value, 2) if isinstance(value := row.get(name), float) else value for name in COLUMNS
     }

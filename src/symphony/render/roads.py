@@ -56,7 +56,7 @@ def draw_boxes(
 def pieces(path: NDArray[Any], valid: NDArray[Any] | None = None) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Cut a path into its steps, leaving out those with an end that is not valid or not finite.
 
-    Gives the steps [K, 2, 2] of a path [T, 2], and the index [K] each begins at.
+    Returns the steps [K, 2, 2] of a path [T, 2], and the index [K] each begins at.
     """
     seen = np.isfinite(path).all(-1) if valid is None else np.isfinite(path).all(-1) & valid
     begin = np.flatnonzero(seen[:-1] & seen[1:])
@@ -102,7 +102,7 @@ SIGNALS = {
 
 
 def draw_roads(axes: Axes, road: RoadMap, view: View) -> list[Line2D]:
-    """Draw the part of a map that touches the view; gives legend entries for what needs explaining."""
+    """Draw the part of a map that touches the view; return legend entries for what needs explaining."""
     surface = shapely.union_all([road_ribbon(road, k) for k in _visible(road.lanes, view)])
     # Closes the slits where one lane meets the next at an angle.
     surface = surface.buffer(SLIT, quad_segs=2).buffer(-SLIT, quad_segs=2)
@@ -124,7 +124,7 @@ def _draw_lines(axes: Axes, lines: Any, color: str, width: float, zorder: float,
 
 
 def draw_signals(axes: Axes, segment: RunSegment, step: int, view: View) -> list[Line2D]:
-    """Draw the lights at their stop points as they are at a step; gives legend entries of states that can be seen."""
+    """Draw the lights at their stop points as they are at a step; return legend entries of visible states."""
     point, state = segment.signal_point[:, :2], segment.signal_state[:, step]
     inside = _inside(point, view)
     entries: list[Line2D] = []
@@ -166,7 +166,7 @@ def _draw_marks(axes: Axes, road: RoadMap, view: View) -> list[Line2D]:
 
 
 def road_ribbon(road: RoadMap, lane: int) -> Any:
-    """Area covered by one lane: its centre line widened to its width; none for a lane of a single point."""
+    """Return the area covered by one lane: its centre line widened to its width; none for a single point."""
     if len(road.lanes[lane]) < 2:
         return shapely.Polygon()
     width = road.widths[lane]
@@ -175,7 +175,7 @@ def road_ribbon(road: RoadMap, lane: int) -> Any:
 
 
 def lane_arrows(line: NDArray[Any]) -> NDArray[Any]:
-    """[K, 3, 2] chevrons along a polyline [P, 2], pointing the way it runs."""
+    """Return [K, 3, 2] chevrons along a polyline [P, 2], pointing the way it runs."""
     delta = np.diff(line.astype(np.float64), axis=0)
     length = np.hypot(delta[:, 0], delta[:, 1])
     total = float(length.sum())
@@ -192,13 +192,13 @@ def lane_arrows(line: NDArray[Any]) -> NDArray[Any]:
 
 
 def outline(polygon: Any) -> Outline:
-    """A polygon with its holes as one path."""
+    """Return a polygon with its holes as one path."""
     rings = [polygon.exterior, *polygon.interiors]
     return Outline.make_compound_path(*(Outline(np.asarray(r.coords)[:, :2], closed=True) for r in rings))
 
 
 def _visible(lines: Polylines, view: View) -> Iterator[int]:
-    """Indices of the polylines whose bounding box meets the view."""
+    """Yield the indices of the polylines whose bounding box meets the view."""
     for k in range(len(lines)):
         low, high = lines[k][:, :2].min(0), lines[k][:, :2].max(0)
         if low[0] <= view[1] and high[0] >= view[0] and low[1] <= view[3] and high[1] >= view[2]:

@@ -35,19 +35,19 @@ View = tuple[float, float, float, float]  # x from, x to, y from, y to, in metre
 
 
 def agent_color(rank: int) -> str:
-    """Colour of the agent of that rank among the highlighted ones (0: ego)."""
+    """Return the colour of the agent of that rank among the highlighted ones (0: ego)."""
     return AGENT_COLORS[0 if rank == 0 else 1 + (rank - 1) % (len(AGENT_COLORS) - 1)]
 
 
 def new_figure(width: float = 8.0, height: float = 8.0) -> Figure:
-    """An empty figure (inches) that belongs to no window and no global state."""
+    """Return an empty figure (inches) that belongs to no window and no global state."""
     figure = Figure(figsize=(width, height), dpi=130, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def new_panels(count: int, columns: int, width: float, height: float, head: float = 0.0) -> tuple[Figure, list[Axes]]:
-    """A figure of panels, each so many inches wide and high, with room above them."""
+    """Return a figure of panels, each of the given width and height in inches, with room above them."""
     rows = -(-count // columns)
     figure = new_figure(width * columns, height * rows + head)
     grid = figure.add_gridspec(rows, columns)
@@ -55,7 +55,7 @@ def new_panels(count: int, columns: int, width: float, height: float, head: floa
 
 
 def open_target(target: Target, view: View) -> tuple[Axes, Path | None]:
-    """Axes to draw on, and where to save them afterwards (None for axes given by the caller)."""
+    """Return axes to draw on, and where to save them afterwards (None for axes given by the caller)."""
     if isinstance(target, Axes):
         return target, None
     path = picture_path(target)
@@ -66,7 +66,7 @@ def open_target(target: Target, view: View) -> tuple[Axes, Path | None]:
 
 
 def picture_path(path: str | Path, formats: Sequence[str] = FORMATS) -> Path:
-    """The path, if its name says one of the kinds of picture that can be written."""
+    """Return the path if its suffix is that of a picture that can be written; raise a ConfigError otherwise."""
     path = Path(path)
     if path.suffix[1:].lower() not in formats:
         raise ConfigError(f"{path}: a picture's name must end in one of .{', .'.join(formats)}")
@@ -82,7 +82,7 @@ def save(figure: Any, path: Path) -> None:
 
 
 def view_around(points: NDArray[Any], margin: float = 20.0, least: float = 70.0) -> View:
-    """A rectangle around points [P, 2] with a margin, the longer side at least ``least`` metres, the shorter
+    """Return a rectangle around points [P, 2] with a margin, the longer side at least ``least`` metres, the shorter
     at least 0.6 of it.
     """
     points = points[np.isfinite(points).all(-1)]
@@ -97,7 +97,7 @@ def view_around(points: NDArray[Any], margin: float = 20.0, least: float = 70.0)
 
 
 def with_aspect(view: View, aspect: float = 1.0) -> View:
-    """The view, grown about its middle until its height is so many times its width."""
+    """Return the view, grown about its middle until its height is ``aspect`` times its width."""
     width, height = view[1] - view[0], view[3] - view[2]
     x, y = (view[0] + view[1]) / 2, (view[2] + view[3]) / 2
     width, height = max(width, height / aspect), max(height, width * aspect)
@@ -105,7 +105,7 @@ def with_aspect(view: View, aspect: float = 1.0) -> View:
 
 
 def frame(axes: Axes, view: View, title: str, subtitle: str) -> None:
-    """Equal aspect, limits, no ticks, title and scale bar."""
+    """Set equal aspect, limits, no ticks, title and scale bar."""
     axes.set_facecolor(LAND)
     axes.set_xlim(view[0], view[1])
     axes.set_ylim(view[2], view[3])
@@ -121,7 +121,7 @@ def frame(axes: Axes, view: View, title: str, subtitle: str) -> None:
 
 
 def add_caption(axes: Axes, text: str, *, right: bool = False) -> None:
-    """Text between the picture and its title, at the left or the right end of the line."""
+    """Add a text between the picture and its title, at the left or the right end of the line."""
     place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "parse_math": False}
     side = "right" if right else "left"
     caption = axes.annotate(
@@ -132,19 +132,19 @@ def add_caption(axes: Axes, text: str, *, right: bool = False) -> None:
 
 
 def _width(axes: Axes) -> float:
-    """Inches that the axes' slot in the figure is wide, before layout."""
+    """Return the width in inches of the axes' slot in the figure, before layout."""
     figure = axes.get_figure(root=True)
     return axes.get_position(original=True).width * figure.get_figwidth() if figure else 8.0
 
 
 def font(axes: Axes, size: float, text: str = "") -> float:
-    """A font size in points for these axes, smaller on narrow ones and such that the text fits."""
+    """Return a font size in points for these axes, smaller on narrow ones and such that the text fits."""
     room = 72 * _width(axes) / max(0.62 * len(text), 1)
     return max(3.0, min(size * float(np.clip(_width(axes) / 5, 0.6, 1)), room))
 
 
 def add_scale_bar(axes: Axes, view: View) -> None:
-    """A bar of a round length (1, 2 or 5 times a power of ten metres) in the lower left corner."""
+    """Add a bar of a round length (1, 2 or 5 times a power of ten metres) in the lower left corner."""
     span = max(view[1] - view[0], view[3] - view[2])
     power = 10.0 ** math.floor(math.log10(span / 5))
     length = max(step * power for step in (1, 2, 5) if step * power <= span / 5)
@@ -157,7 +157,7 @@ def add_scale_bar(axes: Axes, view: View) -> None:
 
 
 def add_legend(axes: Axes, handles: Sequence[Line2D | Any], points: NDArray[Any]) -> None:
-    """A legend above everything drawn, in the corner that hides the fewest of the points [P, 2]."""
+    """Add a legend above everything drawn, in the corner that hides the fewest of the points [P, 2]."""
     place = free_corner(points, (*axes.get_xlim(), *axes.get_ylim()))
     style: dict[str, Any] = {"framealpha": 0.9, "edgecolor": "#C8C4BC", "handlelength": 1.8, "borderpad": 0.6}
     legend = axes.legend(handles=list(handles), loc=place, fontsize=font(axes, 8.5), **style)
@@ -165,7 +165,7 @@ def add_legend(axes: Axes, handles: Sequence[Line2D | Any], points: NDArray[Any]
 
 
 def free_corner(points: NDArray[Any], view: View) -> Corner:
-    """The corner with the fewest points [P, 2], but for the one of the scale bar."""
+    """Return the corner with the fewest points [P, 2], but for the one of the scale bar."""
     x = (points[:, 0] - view[0]) / (view[1] - view[0])
     y = (points[:, 1] - view[2]) / (view[3] - view[2])
     inside = (x >= 0) & (x <= 1) & (y >= 0) & (y <= 1)

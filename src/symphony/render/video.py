@@ -1,4 +1,4 @@
-"""Rollouts as they unfold, in an animated picture or a film."""
+"""Animated pictures and films of rollouts."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def draw_clips(clips: Sequence[Clip], path: Path, columns: int = 3) -> None:
 
 
 def write_film(clips: Sequence[Clip], path: Path, columns: int) -> None:
-    """What :func:`animate_rollouts` draws, as a film (H.264)."""
+    """Write the animation of :func:`animate_rollouts` as a film (H.264)."""
     try:
         import imageio_ffmpeg  # noqa: PLC0415 - an extra
     except ImportError as error:
@@ -85,7 +85,7 @@ def animate_rollouts(clips: Sequence[Clip], path: str | Path, *, columns: int = 
     log, outlined where they were then. Playback agents and lights are shown as logged. The last frame is the last
     step; shorter segments end earlier and stay as they are. Where nothing moves all frames are the same. Panels are
     at most ``size`` inches wide and high, and ``columns`` in a row. Raises a :class:`ConfigError` for a file that is
-    no .gif.
+    not a .gif.
     """
     file = picture_path(path, ANIMATIONS)
     frames, interval = frames_of(clips, columns=columns, size=size)
@@ -93,7 +93,7 @@ def animate_rollouts(clips: Sequence[Clip], path: str | Path, *, columns: int = 
 
 
 def frames_of(clips: Sequence[Clip], *, columns: int = 3, size: float = 3.6) -> tuple[list[NDArray[np.uint8]], float]:
-    """The frames [H, W, 3] of :func:`animate_rollouts`, and the seconds between two of them."""
+    """Return the frames [H, W, 3] of :func:`animate_rollouts`, and the seconds between two of them."""
     panels = [_Panel(clip) for clip in clips]
     figure = _lay_out(panels, min(columns, len(clips)), size)
     canvas = FigureCanvasAgg(figure)
@@ -124,7 +124,7 @@ class _Panel:
 
     @property
     def aspect(self) -> float:
-        """Height of the view, with its width 1."""
+        """The height of the view relative to its width."""
         return (self.view[3] - self.view[2]) / (self.view[1] - self.view[0])
 
     def settle(self, axes: Axes) -> None:
@@ -147,18 +147,18 @@ class _Panel:
         self.still = set(axes.get_children())
 
     def above(self) -> list[Artist]:
-        """What nothing that moves may hide."""
+        """Return the artists that nothing that moves may hide."""
         return [artist for artist in self.still if isinstance(artist, Legend | AnchoredOffsetbox)]
 
     def draw(self, time: float) -> None:
-        """Draw what moves as it is some seconds after the first step, and forget it."""
+        """Draw what moves as it is ``time`` seconds after the first step, and forget it."""
         self._draw_moving(min(round(time / self.segment.dt), self.steps - 1))
         for artist in sorted(self._moving(), key=Artist.get_zorder):
             self.axes.draw_artist(artist)
         self._remove_moving()
 
     def _draw_moving(self, at: int) -> list[Line2D]:
-        """Add what moves, as it is at one of the steps; returns legend entries for lights and events."""
+        """Add what moves, as it is at one of the steps; return legend entries for lights and events."""
         axes, segment, clip, step = self.axes, self.segment, self.clip, self.clip.start + at
         marks = draw_signals(axes, segment, step, self.view)
         plots.draw_playback(axes, segment, step, clip.others)
@@ -187,7 +187,7 @@ class _Panel:
 
 
 def _lay_out(panels: Sequence[_Panel], columns: int, size: float) -> Figure:
-    """A figure with the panels settled in it, all of one size as far as nobody said what they show."""
+    """Return a figure with the panels laid out in it, all of one size unless someone chose their views."""
     aspect = min(1.0, max(panel.aspect for panel in panels))
     for panel in panels:
         if panel.clip.view is None:
@@ -203,7 +203,7 @@ def _lay_out(panels: Sequence[_Panel], columns: int, size: float) -> Figure:
 
 
 def _times(panels: Sequence[_Panel]) -> tuple[NDArray[np.float64], float]:
-    """Seconds after the first step of each frame, the last step's among them, and between two frames."""
+    """Return seconds after the first step of each frame, the last step's among them, and between two frames."""
     dt = min(panel.segment.dt for panel in panels)
     count = 1 + round(max((panel.steps - 1) * panel.segment.dt for panel in panels) / dt)
     every = -(-count // FRAMES)
@@ -211,7 +211,7 @@ def _times(panels: Sequence[_Panel]) -> tuple[NDArray[np.float64], float]:
 
 
 def _write(frames: Sequence[NDArray[np.uint8]], path: Path, interval: float) -> None:
-    """Write frames [H, W, 3] that follow each other after so many seconds."""
+    """Write frames [H, W, 3] that follow each other after ``interval`` seconds."""
     # One palette for all: with their own, frames would differ, and flicker, where nothing moves.
     some = np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]])
     palette = Image.fromarray(some).quantize(COLORS, Image.Quantize.FASTOCTREE)

@@ -1,4 +1,4 @@
-"""Which lane a vehicle is on, and which branching regions a trajectory visits (for the curvature JSD, section V)."""
+"""The lane a vehicle is on, and the branching regions a trajectory visits (for the curvature JSD, section V)."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def lane_of(
     tolerance: float = LATERAL,
     keep: Callable[[Near], Bools] | None = None,
 ) -> Indices:
-    """Lane of each vehicle, -1 where there is none.
+    """Return the lane of each vehicle, -1 where there is none.
 
     It is the nearest centre line that points the same way within :data:`LANE_TURN`. Lanes within a quarter of a
     metre of the nearest are told apart by heading, then by index.
 
-    Takes positions [..., 2] and headings [...], the largest distance from the centre line in metres, and what says
-    which of some pairs of a vehicle and a lane near to it count, where not all do. Raises ValueError for a position
-    or heading that is not finite; names the vehicle.
+    Takes positions [..., 2] and headings [...], the largest distance from the centre line in metres, and a function
+    of which pairs of a vehicle and a lane near it count, where not all do. Raises ValueError for a position or
+    heading that is not finite; names the vehicle.
     """
     position = np.asarray(position, dtype=np.float64)
     wrong = np.argwhere(~(np.isfinite(position).all(-1) & np.isfinite(heading)))
@@ -49,7 +49,7 @@ def lane_of(
 
 
 def starting_lanes(graph: LaneGraph, position: NDArray[Any], heading: float) -> list[tuple[int, float]]:
-    """Every lane one vehicle may be on: inside a junction, where lanes overlap, usually several.
+    """Return every lane one vehicle may be on: inside a junction, where lanes overlap, usually several.
 
     These are lanes at most :data:`MARGIN` metres farther away than the nearest one. Of a lane and its successor only
     the one that the vehicle is alongside is kept. The lane that :func:`lane_of` names comes first, then by distance.
@@ -75,7 +75,7 @@ def starting_lanes(graph: LaneGraph, position: NDArray[Any], heading: float) -> 
 
 
 def _nearest(graph: LaneGraph, near: Near, turn: NDArray[np.float64], count: int) -> Indices:
-    """[count] lane of each point, see :func:`lane_of`, from lanes near to them and the angles to these."""
+    """Return the lane [count] of each point, see :func:`lane_of`, from lanes near to them and the angles to these."""
     result = np.full(count, -1, dtype=np.int64)
     smallest = np.full(count, np.inf)
     np.minimum.at(smallest, near.point, near.distance)
@@ -103,7 +103,7 @@ TURN = math.pi / 4  # largest angle between a vehicle on a region and the region
 def visited_regions(
     graph: LaneGraph, position: NDArray[Any], heading: NDArray[Any], valid: NDArray[np.bool_]
 ) -> Bools:
-    """Which branching regions each trajectory took.
+    """Return which branching regions each trajectory took.
 
     A trajectory comes to a choice where the path between two consecutive valid states passes the first point of
     one of its regions, or where the first valid state is on one of them already. From there until it comes to the
@@ -111,7 +111,7 @@ def visited_regions(
     region if it lies within 2 m of the centre line with a compatible heading, and clearly so if every alternative
     is at least half a metre farther away. So of the alternatives of one choice each pass takes at most one.
 
-    Takes positions [..., T, 2] and headings [..., T]; gives [..., R], in the order of ``graph.regions``. Raises
+    Takes positions [..., T, 2] and headings [..., T]; returns [..., R], in the order of ``graph.regions``. Raises
     ValueError for a valid state that is not finite.
     """
     lead, steps = valid.shape[:-1], valid.shape[-1]
@@ -150,7 +150,7 @@ def visited_regions(
 def visited_curvatures(
     graph: LaneGraph, position: NDArray[Any], heading: NDArray[Any], valid: NDArray[np.bool_]
 ) -> Reals:
-    """Average curvatures, 1/m, of all regions visited by any of the trajectories, one entry per visit.
+    """Return average curvatures, 1/m, of all regions visited by any of the trajectories, one entry per visit.
 
     Shapes as in :func:`visited_regions`.
     """
@@ -161,7 +161,7 @@ def visited_curvatures(
 def _states_on(
     graph: LaneGraph, begins: Bools, points: Reals, headings: Reals, first: Indices, place: Indices
 ) -> tuple[Indices, Indices, Indices]:
-    """States clearly on a region, ascending, those regions, and pairs [K, 2] (choice, first state on it).
+    """Return states clearly on a region, ascending, those regions, and pairs [K, 2] (choice, first state on it).
 
     Takes whether a trajectory begins with a state [n], its point and heading, a state at each of the distinct places,
     and the number of the place of each state [n].
@@ -183,7 +183,7 @@ def _states_on(
 
 
 def _passes(graph: LaneGraph, row: Indices, points: Reals, headings: Reals, place: Indices) -> Indices:
-    """Pairs [K, 2] of a choice and the last state before the entry point of one of its regions is passed."""
+    """Return pairs [K, 2] of a choice and the last state before one of its regions' entry points is passed."""
     here = np.flatnonzero(row[1:] == row[:-1])
     start, end = points[here], points[here + 1]
     # From place to place, each way once.
@@ -203,10 +203,10 @@ def _passes(graph: LaneGraph, row: Indices, points: Reals, headings: Reals, plac
 
 
 def _repeated(found: Indices, place: Indices, count: int) -> tuple[Indices, Indices]:
-    """What was found at distinct places, for all states at them.
+    """Expand the findings at distinct places to all states at them.
 
-    Takes numbers of places [K], ascending, that of each state [n] and how many places there are. Gives states,
-    ascending, and the numbers in ``found`` of what was found where they are, ascending for each.
+    Takes numbers of places [K], ascending, that of each state [n] and how many places there are. Returns states,
+    ascending, and the numbers in ``found`` of the findings where they are, ascending for each.
     """
     each = np.bincount(found, minlength=count)
     number, first = each[place], (each.cumsum() - each)[place]
@@ -215,7 +215,7 @@ def _repeated(found: Indices, place: Indices, count: int) -> tuple[Indices, Indi
 
 
 def _new_passes(events: Indices, begins: Bools) -> tuple[Indices, Indices]:
-    """Choices and first states of the passes, in order; events at consecutive states are one pass."""
+    """Return choices and first states of the passes, in order; events at consecutive states are one pass."""
     parent, state = np.unique(events, axis=0).T
     follows = (parent[1:] == parent[:-1]) & (state[1:] == state[:-1] + 1) & ~begins[state[1:]]
     new = np.ones(len(parent), dtype=bool)

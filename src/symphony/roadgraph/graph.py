@@ -29,13 +29,13 @@ class Near(NamedTuple):
     heading: Reals  # direction of the line there, radians
 
     def only(self, keep: Bools | Indices) -> Near:
-        """Some of the pairs."""
+        """Return some of the pairs."""
         point, line, distance, along, heading = self
         return Near(point[keep], line[keep], distance[keep], along[keep], heading[keep])
 
 
 class LineIndex:
-    """Spatial index over polylines [P_k, 2] in metres, without repeated points."""
+    """A spatial index over polylines [P_k, 2] in metres, without repeated points."""
 
     def __init__(self, lines: Sequence[Reals]) -> None:
         self.geometry = line_strings(lines)
@@ -52,7 +52,7 @@ class LineIndex:
         self._begin = np.concatenate(begins) if begins else np.zeros(0)
 
     def near(self, points: Reals, reach: float) -> Near:
-        """All pairs of a point [n, 2] and a line at most ``reach`` metres apart, sorted by point, then line."""
+        """Return all pairs of a point [n, 2] and a line at most ``reach`` metres apart, by point, then line."""
         geometry = shapely.points(points)
         point, line = self._tree.query(geometry, predicate="dwithin", distance=reach)
         order = np.lexsort((line, point))
@@ -62,13 +62,13 @@ class LineIndex:
         return Near(point, line, distance, along, self.heading(line, along))
 
     def heading(self, line: NDArray[Any], along: Reals) -> Reals:
-        """Direction of lines [K] at ``along`` [K] metres from their start."""
+        """Return the direction of lines [K] at ``along`` [K] metres from their start."""
         segment = np.searchsorted(self._begin, self._base[line] + along, side="right") - 1
         return self._heading[np.clip(segment, self._first[line], self._first[line + 1] - 1)]
 
 
 def arc_lengths(line: Reals) -> Reals:
-    """Metres [P] from the beginning of a line to each of its points."""
+    """Return the metres [P] from the beginning of a line to each of its points."""
     way = line[1:] - line[:-1]
     arc = np.zeros(len(line))
     np.cumsum(np.hypot(way[:, 0], way[:, 1]), out=arc[1:])
@@ -76,13 +76,13 @@ def arc_lengths(line: Reals) -> Reals:
 
 
 def line_strings(lines: Sequence[Reals]) -> NDArray[Any]:
-    """[lines] shapely geometries of polylines [P_k, 2], all made at once."""
+    """Return [lines] shapely geometries of polylines [P_k, 2], all made at once."""
     owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
     return shapely.linestrings(np.concatenate([*lines, np.zeros((0, 2))]), indices=owner)
 
 
 def turn_between(a: Reals, b: Reals) -> Reals:
-    """Absolute difference of two headings, in [0, pi]."""
+    """Return the absolute difference of two headings, in [0, pi]."""
     return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi)
 
 
@@ -126,7 +126,7 @@ class LaneGraph:
         left: per lane, the lanes a change to the left reaches.
         right: per lane, the lanes a change to the right reaches.
         regions: the branching regions, by parent, then by lane.
-        followed: lines [P, 2] of pairs of a lane and its successor that were looked for already, see
+        followed: lines [P, 2] of pairs of a lane and its successor that were sought already, see
             :func:`symphony.roadgraph.paths.followed`.
         gentle: of lanes that were looked at already, see :func:`symphony.roadgraph.paths.gentle`.
     """

@@ -1,4 +1,4 @@
-"""The line that a vehicle follows along lanes: forward only, without the jumps that maps have where lanes meet.
+"""The line that a vehicle follows along lanes: forward only, without the jumps of maps where lanes meet.
 
 Arrays of points are [P, 2] in metres, in the map's frame.
 """
@@ -25,7 +25,7 @@ _JOIN = 6.0
 
 
 def blend(line: Reals, point: Reals, length: float) -> Reals:
-    """The way from a point beside a line onto it.
+    """Return the way from a point beside a line onto it.
 
     The way runs beside the line, from where the point is along it, and comes nearer like 1 - 3 u² + 2 u³, with u from
     0 to 1 over the length: it begins and ends in the direction of the line. Beyond that it is the line itself. Where
@@ -57,7 +57,7 @@ def blend(line: Reals, point: Reals, length: float) -> Reals:
 
 
 def beside(line: Reals, point: Reals) -> tuple[float, float]:
-    """Metres along a line of its place nearest to a point, and from there to the point.
+    """Return the metres along a line of its place nearest to a point, and from there to the point.
 
     A point before the beginning has a negative place, on the line as it would come straight from there; one past the
     end has the length of the line.
@@ -76,14 +76,14 @@ def beside(line: Reals, point: Reals) -> tuple[float, float]:
 
 
 def at(line: Reals, arc: Reals, places: Reals) -> Reals:
-    """Points [Q, 2] so many metres along a line [P, 2] with arc lengths [P]; past its ends, those."""
+    """Return points [Q, 2] at ``places`` metres along a line [P, 2] with arc lengths [P]; past its ends, those."""
     found = np.empty((len(places), 2))
     found[:, 0], found[:, 1] = np.interp(places, arc, line[:, 0]), np.interp(places, arc, line[:, 1])
     return found
 
 
 def followed(graph: LaneGraph, before: int, lane: int) -> Reals:
-    """The centre line of a lane as one follows it from the end of the lane before, without that end itself.
+    """Return the centre line of a lane as followed from the end of the lane before, without that end itself.
 
     It is the lane's own line where the two meet. Where they do not, what overlaps is left out, and what lies aside is
     made up for by a short blend.
@@ -100,7 +100,7 @@ def followed(graph: LaneGraph, before: int, lane: int) -> Reals:
 
 
 def centre_line(graph: LaneGraph, lanes: Sequence[int], start: float = 0.0) -> Reals:
-    """The line [P, 2] along lanes, each the successor of the one before, from so many metres along the first one."""
+    """Return the line [P, 2] along lanes, each the successor of the last, from ``start`` metres on the first."""
     first, arc = graph.lines[lanes[0]], graph.arc[lanes[0]]
     start = min(max(start, 0.0), float(arc[-1]))
     parts = [at(first, arc, np.array([start])), first[arc > start + _CLOSE]] if start > 0.0 else [first]
@@ -108,12 +108,12 @@ def centre_line(graph: LaneGraph, lanes: Sequence[int], start: float = 0.0) -> R
 
 
 def distinct(line: Reals) -> Reals:
-    """A line without points that lie on the one before."""
+    """Return a line without points that lie on the one before."""
     return line[np.concatenate(([True], np.hypot(*np.diff(line, axis=0).T) > _CLOSE))]
 
 
 def sharpest(line: Reals, spacing: float = 0.5) -> float:
-    """The largest change of direction, in radians, from one piece of :data:`CHORD` metres of a line to the next.
+    """Return the largest change of direction, in radians, between pieces of :data:`CHORD` metres of a line.
 
     Pieces may begin anywhere. It is 0 for a line that is shorter than two of them.
     """
@@ -128,7 +128,7 @@ def sharpest(line: Reals, spacing: float = 0.5) -> float:
 
 
 def gentle(graph: LaneGraph, lane: int) -> bool:
-    """Whether a lane nowhere turns by more than :data:`GENTLE`, so that a change beside it cannot be too sharp."""
+    """Return whether a lane never turns by more than :data:`GENTLE`: a change beside it can't be too sharp."""
     if lane not in graph.gentle:
         graph.gentle[lane] = sharpest(graph.lines[lane]) < GENTLE
     return graph.gentle[lane]

@@ -1,4 +1,4 @@
-"""Feasible routes: the ways a vehicle can take along lanes, and the one it did (section III of the paper)."""
+"""Feasible routes: the ways a vehicle can take along lanes, and the one it took (section III of the paper)."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def routes(
     onward: float = 0.0,
     limit: int = LIMIT,
 ) -> list[Route]:
-    """Lane sequences that follow every branch until they reach the horizon or the lanes end.
+    """Return lane sequences that follow every branch until they reach the horizon or the lanes end.
 
     Routes without a lane change come first, by start and then by lane index; those with one change follow as far as
     the limit allows. A change is offered where it first becomes possible: on the lane of the start, and where a
@@ -81,7 +81,7 @@ def routes(
 def _complete(graph: LaneGraph, seeds: Sequence[Path], horizon: float, limit: int) -> list[Path]:
     """Extend each path to the horizon; nearest choices first, so that the limit cuts only the farthest.
 
-    Lanes of next to no length in a circle would never get there: a path ends after :data:`MAX_LANES`.
+    Very short lanes in a circle would never get there: a path ends after :data:`MAX_LANES`.
     """
     frontier = sorted(set(seeds))[:limit]
     heapq.heapify(frontier)
@@ -101,7 +101,7 @@ def _complete(graph: LaneGraph, seeds: Sequence[Path], horizon: float, limit: in
 
 
 def _onward(graph: LaneGraph, reach: float, route: Route, until: float) -> Route:
-    """A route that goes on along the straightest lanes until it reaches so far."""
+    """Return a route that goes on along the straightest lanes until it reaches ``until``."""
     lanes = list(route.lanes)
     while reach < until and graph.successors[lanes[-1]] and len(lanes) < MAX_LANES:
         lanes.append(_straightest(graph, graph.successors[lanes[-1]]))
@@ -114,7 +114,7 @@ def _straightest(graph: LaneGraph, lanes: Sequence[int]) -> int:
 
 
 def _changes(graph: LaneGraph, plain: Sequence[Route], along: dict[int, float], horizon: float) -> list[Path]:
-    """Paths up to and including the lane that a change leads to."""
+    """Return the paths up to and including the lane that a change leads to."""
     found: dict[Route, float] = {}
     known: dict[tuple[int, int, float], tuple[float, float] | None] = {}
     for route in plain:
@@ -144,8 +144,8 @@ def _changes(graph: LaneGraph, plain: Sequence[Route], along: dict[int, float], 
 
 
 def _change_at(graph: LaneGraph, lane: int, other: int, start: float) -> tuple[float, float] | None:
-    """Metres along a lane, from ``start`` on, at which a change to another begins, and metres along that one; None
-    where the two are not side by side.
+    """Return metres along a lane, from ``start`` on, at which a change to another begins, and metres along that one;
+    None where the two are not side by side.
     """
     line, target = graph.lines[lane], graph.lines[other]
     begins = max(start, paths.beside(line, target[0])[0])
@@ -165,7 +165,7 @@ def _change_at(graph: LaneGraph, lane: int, other: int, start: float) -> tuple[f
 
 
 def change_length(speed: float) -> float:
-    """Metres that a change of lanes takes at a speed in m/s."""
+    """Return the metres that a change of lanes takes at a speed in m/s."""
     return max(CHANGE_METRES, CHANGE_SECONDS * abs(speed))
 
 
@@ -176,7 +176,7 @@ def route_line(
     speed: float = 0.0,
     changes: dict[Route, Reals | None] | None = None,
 ) -> Reals | None:
-    """The line [P, 2] that a vehicle follows on a route, in the graph's own points; None where nobody can drive it.
+    """Return the line [P, 2] that a vehicle follows on a route, in the graph's points; None if nobody can drive it.
 
     It is the centre line of the lanes, each joined to the one before. A change is a
     :func:`~symphony.roadgraph.paths.blend` from the lane it leaves to the one beside it, :func:`change_length` long,
@@ -204,7 +204,7 @@ def route_line(
 
 
 def _changed(graph: LaneGraph, route: Route, start: float, speed: float) -> Reals | None:
-    """The line of a route with a change; None if nobody can drive it."""
+    """Return the line of a route with a change; None if nobody can drive it."""
     before, after = route.lanes[: route.change], route.lanes[route.change :]
     left, arc = graph.lines[before[-1]], graph.arc[before[-1]]
     point = paths.at(left, arc, np.array([route.begins]))[0]
@@ -234,10 +234,10 @@ def route_lines(
     length: float,
     speed: float = 0.0,
 ) -> tuple[list[Route], list[Reals]]:
-    """Routes that can be driven, without those that are the same within :data:`SAME`, and their lines.
+    """Return the routes that can be driven, without those that are the same within :data:`SAME`, and their lines.
 
-    Of several that are the same the first is kept. Lines begin so many metres ``along`` the first lanes, end after a
-    length in metres, and have points that are ``spacing`` metres apart; the last piece may be shorter.
+    Of several that are the same the first is kept. Lines begin ``along`` metres on the first lanes, end after a
+    length in metres, and have points ``spacing`` metres apart; the last piece may be shorter.
     """
     kept: list[Route] = []
     lines: list[Reals] = []
@@ -261,7 +261,7 @@ def route_lines(
 
 
 def ends_inside(graph: LaneGraph, line: Reals) -> bool:
-    """Whether a line [P, 2] ends where the map goes on.
+    """Return whether a line [P, 2] ends where the map goes on.
 
     That is more than 20 m within the convex hull of all lanes, or where a lane lies ahead of its end, at most 30 m
     away, 2.5 m aside and 30 degrees turned.
@@ -278,7 +278,7 @@ def ends_inside(graph: LaneGraph, line: Reals) -> bool:
 
 
 def resampled(line: Reals, spacing: float, length: float = np.inf) -> Reals:
-    """Points [Q, 2], Q >= 2, of a line so many metres apart, up to a length; the last piece may be shorter."""
+    """Return points [Q, 2], Q >= 2, of a line ``spacing`` metres apart, up to a length; the last may be nearer."""
     arc = paths.arc_lengths(line)
     end = min(length, arc[-1])
     places = np.append(np.arange(0.0, end - 1e-6, spacing), end)
@@ -286,7 +286,7 @@ def resampled(line: Reals, spacing: float, length: float = np.inf) -> Reals:
 
 
 def route_errors(lines: Sequence[Reals], path: Float[NDArray[Any], "T 2"]) -> Float[NDArray[np.float64], " G"]:
-    """Mean distance in metres of what was driven to each of the lines [P, 2] that may be followed.
+    """Return the mean distance in metres of a driven path to each of the lines [P, 2] that may be followed.
 
     Only the part of a line that can have been reached counts. Of a line that comes by a place twice only the pass
     counts that the path is on: else one that goes around the block first would be as right as the direct one.
@@ -322,7 +322,7 @@ def route_errors(lines: Sequence[Reals], path: Float[NDArray[Any], "T 2"]) -> Fl
 
 
 def _returns(lines: Float[NDArray[np.float64], "R P 2"], spacing: float) -> Bool[NDArray[np.bool_], " R"]:
-    """Which lines come near a place that they were at before."""
+    """Return which lines come near a place that they were at before."""
     place = np.arange(lines.shape[1])
     later = place[None] - place[:, None] > _RETURN_METRES / spacing
     first, second = np.nonzero(later)
@@ -335,11 +335,11 @@ def _returns(lines: Float[NDArray[np.float64], "R P 2"], spacing: float) -> Bool
 def ground_truth_routes(
     lines: Sequence[Reals], trajectory: Float[NDArray[Any], "T 2"], valid: Bool[NDArray[np.bool_], " T"]
 ) -> Bool[NDArray[np.bool_], " G"]:
-    """The feasible routes with the smallest displacement error to the logged trajectory (paper, section IV-B).
+    """Return the feasible routes with the smallest displacement error to the logged trajectory (paper, section IV-B).
 
     The error is that of :func:`route_errors`. Routes whose errors are within a millimetre are equally right: those
-    that part beyond the trajectory's end, and all of them where no step is valid. To take one of them by its place
-    would bias what is learned of choices.
+    that diverge beyond the trajectory's end, and all of them where no step is valid. To take one of them by its place
+    would bias what is learned about choices.
 
     Takes the lines of routes (:func:`route_lines`) and a trajectory. Raises ValueError where there are no routes.
     """

@@ -1,6 +1,6 @@
-"""Background traffic: vehicles that nobody evaluates, driven by a rule, all rollouts at a time.
+"""Background traffic: vehicles that are not evaluated, driven by a rule, all rollouts at a time.
 
-Legend: B scenes, N driven agents, K points of a route, P background agents that are there, in any rollout.
+Legend: B scenes, N driven agents, K points of a route, P background agents that are present, in any rollout.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _WITH = 0.25
 
 
 def constant_speed(env: DrivingEnv) -> TensorDictModule:
-    """Background agents keep speed and heading."""
+    """Build a module with which background agents keep speed and heading."""
 
     def onward(state: Float[Tensor, "*b N 4"]) -> Float[Tensor, "*b N 4"]:
         moved = state[..., :2] + state[..., 3:] * env.dt * _unit(state[..., 2])
@@ -45,11 +45,11 @@ def constant_speed(env: DrivingEnv) -> TensorDictModule:
 
 
 class CarFollower(TensorDictModuleBase):
-    """Background agents follow the routes of the log at the speed of the intelligent driver model.
+    """Drives background agents along the routes of the log at the speed of the intelligent driver model.
 
     It does what :class:`symphony.planners.included.IDMPlanner` does for one vehicle, with its parameters, for many at
-    a time: boxes of others are taken by their extent along and across the route, and only the nearest ones ahead are
-    looked at. One without a route goes straight on.
+    a time: boxes of others are taken by their extent along and across the route, and only the nearest ones ahead
+    count. One without a route goes straight on.
 
     Args:
         env: whose scenes have routes.
@@ -86,7 +86,7 @@ class CarFollower(TensorDictModuleBase):
         return tensordict.set(keys.BACKGROUND, moved.reshape(tensordict.get(keys.STATE).shape))
 
     def _driven(self, row: Tensor, at: Tensor, n: Tensor, speed: Tensor) -> Float[Tensor, " P"]:
-        """About how far agents have come since they entered, by the mean of their speeds then and now."""
+        """Return about how far agents have come since they entered, by the mean of their speeds then and now."""
         scenes, enter = self.env.scenes, self.env.scenes.enter[row, n]
         before = scenes.log_state[row, enter, scenes.interactive[row, n], 3:].norm(dim=-1)
         return (at - enter).clamp_min(0) * self.env.dt * 0.5 * (before + speed)
@@ -108,7 +108,7 @@ class CarFollower(TensorDictModuleBase):
     def _leader(
         self, line: _Lines, now: Objects, m: Tensor, agent: Tensor, own: Tensor, size: Tensor, station: Tensor
     ) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
-        """Gap to what is next in front, infinite for nothing, and its speed along the route."""
+        """Return the gap to what is next in front, infinite for nothing, and its speed along the route."""
         delta = now.state[m, :, :2] - own[:, None, :2]
         squared = delta.square().sum(-1)
         # Behind is what is behind on any bend that a vehicle can take within its own length.
@@ -130,7 +130,7 @@ class CarFollower(TensorDictModuleBase):
         return gap, speed.gather(-1, which[:, None])[:, 0].clamp_min(0.0)
 
     def _red(self, line: _Lines, row: Tensor, at: Tensor, front: Tensor, speed: Tensor) -> Float[Tensor, " P"]:
-        """Gap to the next light of the route that is red, or amber with room to stop; infinite for none."""
+        """Return the gap to the route's next light that is red, or amber with room to stop; infinite for none."""
         scenes = self.env.scenes
         shown = scenes.light[row, at.clamp(max=scenes.light.shape[1] - 1)]
         gap = line.stop - front[:, None]
@@ -151,7 +151,7 @@ class _Lines(NamedTuple):
 
 
 def _routes(scenes: SceneBatch, driver: included.IDMPlanner) -> _Lines:
-    """The routes of the log of all agents [B, N]; without one, straight on from where an agent enters."""
+    """Return the log's routes of all agents [B, N]; without one, straight on from where an agent enters."""
     row = torch.arange(len(scenes), device=scenes.route_point.device)
     points, exist = scenes.routes.of(row, scenes.route_logged).lines()
     enters = scenes.log_state[row[:, None], scenes.enter, scenes.interactive]
@@ -189,7 +189,7 @@ def _limits(scenes: SceneBatch, points: Tensor, unknown: float) -> Float[Tensor,
 
 
 def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
-    """Metres along the routes at which lights stop them.
+    """Return metres along the routes at which lights stop them.
 
     A light is on a route if its stop point is; of several with one stop point, that whose lane leads most nearly to
     where the route goes.
@@ -213,8 +213,8 @@ def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
 
 
 def _own_station(line: _Lines, own: Float[Tensor, "P 4"], driven: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
-    """Metres along of agents that follow the lines: of the places nearly nearest that lead their way the one that
-    fits the way driven best, as routes lead around blocks.
+    """Return the metres along of agents that follow the lines: of the almost nearest places in their direction the
+    one that fits the distance driven best, as routes lead around blocks.
     """
     way = line.points.diff(dim=1)
     with_it = (way * _unit(own[:, 2])[:, None]).sum(-1) > _WITH * way.norm(dim=-1)
@@ -234,7 +234,7 @@ def _steering(line: _Lines, own: Tensor, length: Tensor, station: Tensor) -> Flo
 
 
 def _within(line: _Lines, low: Float[Tensor, " P"], length: Tensor | float) -> Bool[Tensor, "P pieces"]:
-    """Pieces of the lines that reach into what lies from `low` metres along on for `length` metres."""
+    """Return which pieces of the lines reach into the ``length`` metres from `low` metres along on."""
     return (line.arc[:, 1:] >= low[:, None]) & (line.arc[:, :-1] <= (low + length)[:, None])
 
 
@@ -244,8 +244,8 @@ def _project(
     pieces: Bool[Tensor, "P pieces"] | None = None,
     about: Float[Tensor, " P"] | None = None,
 ) -> tuple[Float[Tensor, "P J"], Float[Tensor, "P J"], Float[Tensor, "P J"]]:
-    """Metres along, metres to the left, and heading of the line, at its places nearest to some: of several passes of
-    the pieces that count the earliest (see :mod:`symphony.geometry.polylines`), or the nearest to so many metres.
+    """Return metres along, metres to the left, and heading of the line at its places nearest to ``places``: of
+    several passes of ``pieces`` the earliest (see :mod:`symphony.geometry.polylines`), or that nearest to ``about``.
     """
     start, length = line.points[:, :-1], line.arc.diff(dim=-1)
     ahead = line.points.diff(dim=1) / length.clamp_min(1e-6)[..., None]

@@ -1,4 +1,4 @@
-"""Changes that a user makes to agents: goals of single ones, and how bold their draws are."""
+"""Changes that a user makes to agents: goals of single ones, and the temperature of their draws."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ REACH = 3.0
 
 
 def tempered(temperature: float) -> TensorDictModule:
-    """Draw actions [..., N] anew from a policy's logits divided by a temperature, by the same numbers."""
+    """Build a module that draws actions [..., N] again from logits divided by a temperature, by the same numbers."""
 
     def draw(logits: Tensor, noise: Tensor) -> Tensor:
         return inverse_cdf(logits / temperature, noise)
@@ -34,11 +34,11 @@ def tempered(temperature: float) -> TensorDictModule:
 def given_goals(
     goals: Sequence[str], segments: Sequence[RunSegment], scenes: SceneBatch, *, planned: int = 0
 ) -> Int[Tensor, "B N"]:
-    """Numbers of the routes that agents are to follow, -1 where that is left open.
+    """Return the numbers of the routes that agents are to follow, -1 where that is left open.
 
-    A goal is such as ``7=lane:103``, for agent 7 a route over the lane of id 103, or ``7=12.5,-40``, one that comes
-    past a point in the frame of the segment; the nearest of the agent's feasible routes. Each must suit all segments
-    behind the scenes. The first agents, so many of them ``planned``, take none.
+    A goal looks like ``7=lane:103``, for agent 7 a route over the lane of id 103, or ``7=12.5,-40``, one that passes
+    a point in the frame of the segment; the nearest of the agent's feasible routes. Each must suit all segments
+    behind the scenes. The first ``planned`` agents take none.
 
     Raises:
         ConfigError: a goal that can't be read, names an agent that is not driven or has one already, or a lane that
@@ -69,7 +69,7 @@ def given_goals(
 
 
 def _place(goal: str, where: str, segment: RunSegment) -> NDArray[np.float64]:
-    """Points [P, 2] that a route must come near."""
+    """Return points [P, 2] that a route must come near."""
     if where.startswith("lane:"):
         row = np.flatnonzero(segment.road.lane_id.astype(str) == where.removeprefix("lane:"))
         if not len(row):
@@ -86,7 +86,7 @@ def _place(goal: str, where: str, segment: RunSegment) -> NDArray[np.float64]:
 
 
 def _distances(scenes: SceneBatch, b: int, n: int, target: NDArray[np.object_]) -> list[float]:
-    """Metres from points to each route of an agent, on average; infinite for one that is no line."""
+    """Return metres from points to each route of an agent, on average; infinite for one that is not a line."""
     found = []
     for route, count in enumerate(scenes.route_count[b, n].tolist()):
         line = shapely.LineString(scenes.whole_route(b, n, route).cpu().numpy()) if count > 1 else None

@@ -1,4 +1,4 @@
-"""Who is driven in a run segment beyond the pair of the paper: many or all of its vehicles.
+"""Driving more of a run segment than the pair of the paper: many or all of its vehicles.
 
 Legend: A agents of a segment, N driven ones.
 """
@@ -36,13 +36,13 @@ PAIR = 2
 
 @dataclass(frozen=True)
 class Crowd:
-    """Which agents of a segment are driven: so many by the agent at most, those that move, or everyone who moves or
-    stands in a lane. Those beyond :data:`PAIR` must come within a radius of the ego in the log (metres; 0 for no
-    limit). In open traffic they enter and leave. Where there is a background, the other vehicles are driven, too, by
-    a rule, up to :data:`MOST` with these; along routes, vehicles that are on no lane play back the log. Those
-    ``also`` driven, by ids, come after the ego, beside the others. ``onward`` says how traffic goes on where the log
-    ends before the duration: who enters then is driven by the agent if everyone is, else by the background's rule;
-    without either nobody enters.
+    """The choice of driven agents of a segment: at most a number that move, or all that move or stand in a lane.
+    Those beyond :data:`PAIR` must come within a radius of the ego in the log (metres; 0 for no limit). In open
+    traffic they enter and leave. Where there is a background, the other vehicles are driven, too, by a rule, up to
+    :data:`MOST` with these; along routes, vehicles that are on no lane play back the log. Those ``also`` driven, by
+    ids, come after the ego, beside the others. ``onward`` says how traffic goes on where the log ends before the
+    duration: those that enter then are driven by the agent if all are, else by the background's rule; without either
+    none enter.
     """
 
     count: int
@@ -55,9 +55,9 @@ class Crowd:
     onward: Onward | None = None
 
     def choose(self, segment: RunSegment, graph: LaneGraph) -> tuple[Indices, Indices]:
-        """Rows of A: those that the agent drives, the ego first, and background agents.
+        """Return rows of A: those that the agent drives, the ego first, and background agents.
 
-        Those there at the first step come in the order of :func:`symphony.data.selection.interactive_choice`, then
+        Those present at the first step come in the order of :func:`symphony.data.selection.interactive_choice`, then
         those that stand in a lane, by their distance; in open traffic then those that come later, by their time and
         then by their distance.
 
@@ -94,7 +94,7 @@ class Crowd:
         return driven, np.array(others[: MOST - len(driven)], np.int64)
 
     def _near(self, segment: RunSegment, rows: Indices) -> NDArray[np.bool_]:
-        """[K] whether agents come near the ego's log at some step that has both."""
+        """Return [K] whether agents come near the ego's log at some step that has both."""
         if not self.radius:
             return np.ones(len(rows), bool)
         delta = segment.position[rows, :, :2] - segment.position[segment.ego, :, :2]
@@ -103,7 +103,7 @@ class Crowd:
 
 
 class CrowdDataset(SceneDataset):
-    """Scenes in which a :class:`Crowd` is driven, whatever number that is in each; other arguments are those of
+    """Scenes in which a :class:`Crowd` is driven, of any size in each; other arguments are those of
     :class:`SceneDataset`.
     """
 
@@ -120,7 +120,7 @@ class CrowdDataset(SceneDataset):
         return partial(CrowdDataset, **self._how), (self.store, self.crowd, self.dynamics, self.indices)
 
     def segment(self, i: int) -> RunSegment:
-        """The run segment behind item ``i``, up to the duration, if need be past its log."""
+        """Return the run segment behind item ``i``, up to the duration, if need be past its log."""
         segment, crowd = self.store[self.indices[i]], self.crowd
         steps = round(self.duration / segment.dt) + 1
         if crowd.onward is None or segment.num_steps >= steps:
@@ -155,7 +155,7 @@ def crowd_dataset(
     routes: bool = False,
     also: Sequence[int] = (),
 ) -> CrowdDataset:
-    """The scenes that a configuration asks for, of all or some rows of a store; a :class:`DataWarning` if its
+    """Return the scenes that a configuration asks for, of all or some rows of a store; a :class:`DataWarning` if its
     generation is not finished. Where the configuration leaves that open, there are ``default`` interactive agents, or
     as many as the agent was trained with; ``routes``: also for an agent that follows none; ``also``: see Crowd.
     """
@@ -176,14 +176,14 @@ def crowd_dataset(
 
 
 def _in_lane(segment: RunSegment, graph: LaneGraph) -> NDArray[np.bool_]:
-    """[A] whether an agent is first seen in a lane: there it waits, elsewhere it is parked."""
+    """Return [A] whether an agent is first seen in a lane: there it waits, elsewhere it is parked."""
     everyone, first = np.arange(segment.num_agents), segment.valid.argmax(1)
     position, heading = segment.position[everyone, first, :2], segment.heading[everyone, first]
     return lane_of(graph, position, heading, tolerance=IN_LANE) >= 0
 
 
 def _distance_at(segment: RunSegment, step: Indices) -> NDArray[np.floating[Any]]:
-    """[A] metres from the ego at a step of each; from where it was last, if it is not seen then."""
+    """Return [A] metres from the ego at a step of each; from where it was last, if it is not seen then."""
     last = np.maximum.accumulate(np.where(segment.valid[segment.ego], np.arange(segment.num_steps), 0))[step]
     own = segment.position[np.arange(segment.num_agents), step, :2]
     return np.linalg.norm(own - segment.position[segment.ego, last, :2], axis=-1)

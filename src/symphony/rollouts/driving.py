@@ -52,10 +52,10 @@ class Simulation(NamedTuple):
         goal: [B, K, N] number of the route that each agent followed, -1 for none.
         search: the trees of which the rollouts are the leaves, [B, trees]; None without any.
         at_states: [B, K, T, N] collisions at states only, as the paper and WOSAC count them.
-        steps: that were simulated for them, each of a rollout or branch.
+        steps: simulated for them, each of a rollout or branch.
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
         drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
-        meant: per scene, trajectories [K, P, T, H, 2] that its planners gave back; None for none.
+        meant: per scene, trajectories [K, P, T, H, 2] that its planners returned; None for none.
     """
 
     rollouts: Rollouts
@@ -78,7 +78,7 @@ def simulation(
     given: Int[Tensor, "B N"] | None = None,
     toward: Callable[[PlannedEnv, TensorDictBase], Any] | None = None,
 ) -> Simulation:
-    """K rollouts of every scene, and how they came about: of a search with the pruned branches, if asked for.
+    """Return K rollouts of every scene, and how they were made: of a search with the pruned branches, if asked for.
 
     ``egos`` plan the first agents of every scene, which no search scores; the agent drives the others. ``given`` are
     the numbers of the routes that agents are to follow, -1 where that is left open. ``toward`` makes, with the
@@ -200,7 +200,7 @@ def simulate_batch(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, **h
 
 
 def _acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig) -> TensorDictModuleBase:
-    """A policy with what a configuration changes in its draws, and with the rule that drives background agents."""
+    """Return a policy with a configuration's changes to its draws and the rule that drives background agents."""
     if config.action_temperature != 1.0:
         if keys.LOGITS not in policy.out_keys or not env.dynamics.discrete:
             raise ConfigError("action-temperature means nothing to this agent: it draws no discrete actions")
@@ -211,7 +211,7 @@ def _acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfi
 def _ruled(
     agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given: Int[Tensor, "B N"] | None
 ) -> tuple[SceneBatch, EvaluateConfig]:
-    """Scenes and settings in which the agent's rule drives everyone, along the routes of the log unless given."""
+    """Return scenes and settings in which the agent's rule drives all, along the routes of the log unless given."""
     if config.others not in ("log", "learned", agent.rule):
         raise ConfigError(f"{agent.name} can't be simulated among others that '{config.others}' drives")
     ruled = scenes.clone(recurse=False)
@@ -232,8 +232,8 @@ def _check_given(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given
 def _fixed(
     scenes: SceneBatch, row: Tensor, goal: Tensor, given: Tensor | None, *, along_log: bool, planned: int
 ) -> Tensor:
-    """Goals [*b, N] that agents follow in rows [*b] of the scenes instead of drawn ones: the first ones, which are
-    planned, and background agents, if asked for, those of the log, others those that are given.
+    """Return the goals [*b, N] that agents follow in rows [*b] of the scenes instead of drawn ones: the first ones,
+    which are planned, and background agents, if asked for, those of the log, others those that are given.
     """
     followed = scenes.route_logged[row]
     if along_log:
@@ -246,7 +246,7 @@ def _fixed(
 
 
 def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Simulation:
-    """Steps after a planner, numbers [B, K, P], failed don't count."""
+    """Exclude the steps after a planner, numbers [B, K, P], failed."""
     each, steps = [planned.failures(row) for row in number], found.rollouts.counted.shape[-2]
     until = [[steps if one is None else one.step for one in row] for row in each]
     going = torch.arange(steps, device=number.device) < torch.tensor(until, device=number.device)[..., None]
@@ -257,9 +257,9 @@ def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Si
 
 
 def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
-    """The configuration beside a planner of the ego: without a search unless one is asked for, as a search asks the
-    planner once for each branch; else in trees of a few branches of which all count, where there shall be rollouts
-    enough.
+    """Return the configuration beside a planner of the ego: without a search unless one is asked for, as a search
+    asks the planner once for each branch; else in trees of a few branches, all of which count, where there are enough
+    rollouts.
     """
     kind: Search = "tree" if config.branches or config.trees > 1 else "none"
     compiled: Compile = "no" if config.compile == "auto" else config.compile
@@ -274,9 +274,9 @@ def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
 def spread_runs(
     agent: Agent, config: EvaluateConfig, runs: int, segments: int, *, planned: bool = False
 ) -> tuple[int, EvaluateConfig]:
-    """How many of the run segments give a number of runs together (a few more where it can't be divided so), and the
-    configuration with as few rollouts of each as that takes: what is independent of each other are segments. Where
-    branches cost calls of a planner, no more trees grow, and so no more segments, than the runs are leaves of.
+    """Return how many of the run segments give ``runs`` runs together (a few more if they can't be divided), and the
+    configuration with as few rollouts of each as that takes: segments are the independent samples. Where branches
+    cost calls of a planner, there are no more trees, and so no more segments, than the runs need as leaves.
     """
     plan = agent.plan(dataclasses.replace(config, rollouts=config.trees))
     whole_trees = planned and plan.kind == "tree"
@@ -286,7 +286,7 @@ def spread_runs(
     least = -(-runs // segments)
 
     def whole(each: int) -> tuple[int, int]:
-        """At least so many rollouts, as many of each tree, and how many trees that takes."""
+        """Return at least ``each`` rollouts, as many of each tree, and how many trees that takes."""
         trees = max(config.trees, -(-each // plan.branches)) if plan.kind == "tree" else 1
         return -(-each // trees) * trees, trees
 
@@ -297,8 +297,8 @@ def spread_runs(
 
 
 def filled_lines(totals: Float[Tensor, "B K P"], threshold: float) -> Int[Tensor, "B K"]:
-    """Which line stands in each place after backtracking: its own, but a good one of its scene where it stayed bad,
-    the total of some period being above the threshold. The places of bad lines take the good ones in turn.
+    """Return which line stands in each place after backtracking: its own, but a good one of its scene where it stayed
+    bad, with the total of some period above the threshold. The places of bad lines take the good ones in turn.
     """
     good = (totals <= threshold).all(-1)
     count, place = good.sum(-1, keepdim=True), torch.arange(good.shape[-1], device=good.device)
@@ -312,7 +312,7 @@ def _branches(part: Tensor, order: Tensor) -> Tensor:
 
 
 def playback(scenes: SceneBatch) -> Rollouts:
-    """The log itself as one rollout per scene [B, 1, ...], counted where it is valid."""
+    """Return the log itself as one rollout per scene [B, 1, ...], counted where it is valid."""
     log, valid = logged(scenes)
     row, height = torch.arange(len(scenes), device=log.device), logged_heights(scenes)
     height = None if height is None else height.flatten(1, 2)
@@ -321,7 +321,7 @@ def playback(scenes: SceneBatch) -> Rollouts:
 
 
 def _logged_collisions(scenes: SceneBatch, *, at_states: bool = False) -> Bool[Tensor, "B T N"]:
-    """See :func:`symphony.metrics.collisions`; what an agent does that is not there is no collision."""
+    """Return :func:`symphony.metrics.collisions` of the log; what an absent agent does is no collision."""
     moves, valid = scenes.log_state.transpose(1, 2), scenes.log_valid.transpose(1, 2)
     subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)
     height = scenes.agent_height.transpose(1, 2) if scenes.agent_height.shape[1] else None

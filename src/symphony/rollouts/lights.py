@@ -28,12 +28,12 @@ _ALWAYS = (SignalState.UNKNOWN, SignalState.FLASHING_STOP, SignalState.FLASHING_
 
 
 def continued(segment: RunSegment, graph: LaneGraph, steps: int, timing: tuple[float, ...] = ()) -> States:
-    """States [Q, U] of the lights of a segment, the first T as logged.
+    """Return the states [Q, U] of the lights of a segment, the first T as logged.
 
     The lights of a junction go on with their cycle where the log shows a whole one: some change of them twice, and
-    what lies so far apart alike. Otherwise, and where a timing (seconds of green, amber and all red) is given, phases
+    equal states that far apart. Otherwise, and where a timing (seconds of green, amber and all red) is given, phases
     take turns, each with the timing or :data:`USUAL`: first those that are green, as long as they are; then those
-    that cross them, then those along them, or whoever has waited longest. Flashing and unknown lights stay so.
+    that cross them, then those along them, or those that have waited longest. Flashing and unknown lights stay so.
     """
     state = _known(segment.signal_state)
     out = np.concatenate([segment.signal_state, np.repeat(state[:, -1:], steps - state.shape[1], 1)], 1)
@@ -50,7 +50,7 @@ def continued(segment: RunSegment, graph: LaneGraph, steps: int, timing: tuple[f
 
 
 def cycle(state: NDArray[Any]) -> int | None:
-    """Steps of the cycle of lights [Q, T] of one junction; None where no whole one is seen."""
+    """Return the steps of the cycle of lights [Q, T] of one junction; None where no whole one is seen."""
     code = np.unique(state, axis=1, return_inverse=True)[1].ravel()
     begins = np.flatnonzero(code[1:] != code[:-1]) + 1
     change = np.stack([code[begins - 1], code[begins]], -1)
@@ -63,13 +63,13 @@ def cycle(state: NDArray[Any]) -> int | None:
 
 
 def _known(state: NDArray[Any]) -> NDArray[Any]:
-    """States with those last known where they are unknown."""
+    """Return states with those last known where they are unknown."""
     step = np.where(state != SignalState.UNKNOWN, np.arange(state.shape[1]), 0)
     return np.take_along_axis(state, np.maximum.accumulate(step, 1), 1) if state.size else state
 
 
 def _junctions(points: NDArray[Any]) -> list[Rows]:
-    """Rows of lights by junction."""
+    """Return the rows of lights by junction."""
     if not len(points):
         return []
     around = shapely.union_all(shapely.buffer(shapely.points(points), 0.5 * JUNCTION))
@@ -78,7 +78,7 @@ def _junctions(points: NDArray[Any]) -> list[Rows]:
 
 
 def _heading(segment: RunSegment, graph: LaneGraph, light: int) -> float:
-    """The way of a light's lane at its stop point."""
+    """Return the direction of a light's lane at its stop point."""
     lane = int(segment.signal_lane[light])
     line = graph.lines[lane]
     if len(line) < 2:
@@ -91,7 +91,7 @@ def _heading(segment: RunSegment, graph: LaneGraph, light: int) -> float:
 def _planned(
     state: NDArray[Any], axis: NDArray[np.float64], steps: int, dt: float, timing: tuple[float, ...]
 ) -> States:
-    """States [Q, steps] after those of the lights of one junction, which are as known [Q, T]."""
+    """Return states [Q, steps] after those of the lights of one junction, which are as known [Q, T]."""
     green, amber, red = timing
     shows, ambers = (np.asarray(np.isin(state, kinds)) for kinds in (GREEN, AMBER))
     logged = state.shape[1]
@@ -129,6 +129,6 @@ def _planned(
 
 
 def _since(flags: NDArray[np.bool_], who: NDArray[np.bool_]) -> int:
-    """Steps up to the end for which all of some rows [Q, T] are set."""
+    """Return the number of steps up to the end for which all of some rows [Q, T] are set."""
     broken = np.flatnonzero(~flags[who].all(axis=0))
     return flags.shape[1] - 1 - int(broken[-1]) if len(broken) else flags.shape[1]

@@ -35,7 +35,7 @@ MOST_ENTER = 512  # vehicles that enter a run segment past its log, at most
 
 @dataclass(frozen=True)
 class Onward:
-    """How traffic goes on past the log: vehicles per second that want to enter on each entrance lane, None for the
+    """Traffic past the end of the log: vehicles per second that want to enter on each entrance lane, None for the
     rates of :func:`entry_rates`; seconds of green, amber and all red of each phase of the lights, none to go on as
     :func:`symphony.rollouts.lights.continued` does; the seed of what is drawn.
     """
@@ -45,7 +45,7 @@ class Onward:
     seed: int = 0
 
     def extended(self, segment: RunSegment, graph: LaneGraph, steps: int, *, enter: bool = True) -> RunSegment:
-        """A segment of so many steps U, the first T of which are those of the log (``logged``).
+        """Return a segment of U ``steps``, the first T of which are those of the log (``logged``).
 
         Past them agents that stood where they were all along still stand there, and no others are seen: they leave,
         or are driven. Vehicles that ``enter`` are rows after those of the log, seen once: where and when they
@@ -111,7 +111,7 @@ class Onward:
 
 
 def entrances(graph: LaneGraph) -> Indices:
-    """[L] lanes by which vehicles come onto the map.
+    """Return the [L] lanes by which vehicles come onto the map.
 
     Neither such a lane nor a lane beside it has a predecessor: one that begins beside others, as a turn pocket does,
     is reached by a lane change. Of several that begin at one place it is the first.
@@ -126,12 +126,12 @@ def entrances(graph: LaneGraph) -> Indices:
 
 
 def entry_rates(segment: RunSegment, graph: LaneGraph) -> Reals:
-    """Vehicles [L] per second that came in by each of the :func:`entrances` of a log.
+    """Return vehicles [L] per second that came in by each of the :func:`entrances` of a log.
 
     Counted are vehicles first seen after the first step, within :data:`NEAR` metres of where a lane begins. Where
-    nobody came in at all, as in logs of those who are there throughout, the flow on the entrance lanes takes their
-    place: metres driven on a lane in terms of its length (Edie, 1963). The mean over lanes has half a vehicle more
-    (Jeffreys' prior), and counts for :data:`PRIOR` seconds at each lane.
+    none came in at all, as in logs of vehicles that are present throughout, the flow on the entrance lanes takes
+    their place: metres driven on a lane in terms of its length (Edie, 1963). The mean over lanes has half a vehicle
+    more (Jeffreys' prior), and counts for :data:`PRIOR` seconds at each lane.
     """
     lanes, seconds = entrances(graph), (segment.num_steps - 1) * segment.dt
     count = np.bincount(_came_in(segment, graph, lanes)[1], minlength=len(lanes)).astype(np.float64)
@@ -146,7 +146,7 @@ def entry_rates(segment: RunSegment, graph: LaneGraph) -> Reals:
 
 
 def _came_in(segment: RunSegment, graph: LaneGraph, lanes: Indices) -> tuple[Indices, Indices]:
-    """Vehicles that came in by some of L lanes, and by which."""
+    """Return the vehicles that came in by some of L lanes, and by which."""
     there = segment.valid & ~beyond(segment.position[..., :2], map_edge(graph))
     who = np.flatnonzero((segment.agent_type == AgentType.VEHICLE) & there.any(1) & ~there[:, 0])
     if not len(who) or not len(lanes):
@@ -161,7 +161,7 @@ def _came_in(segment: RunSegment, graph: LaneGraph, lanes: Indices) -> tuple[Ind
 
 
 def _pace(log: RunSegment, graph: LaneGraph, lane: int, came: Indices, number: float) -> float:
-    """A speed for a vehicle that enters: of one of those that came in by its lane, then, or of one that drives."""
+    """Return a speed for a vehicle that enters: of one of those that came in by its lane, or of one that drives."""
     seen, first = np.linalg.norm(log.velocity, axis=-1), log.valid.argmax(1)
     speeds = seen[came, first[came]]
     if not (speeds := speeds[speeds > STANDING]).size:
@@ -172,7 +172,7 @@ def _pace(log: RunSegment, graph: LaneGraph, lane: int, came: Indices, number: f
 
 
 def _beginnings(log: RunSegment, graph: LaneGraph, lanes: Indices, size: Any) -> tuple[Reals, Reals]:
-    """Centres [V, 3] and headings [V] of boxes whose rears are where their lanes begin, or ahead on a short lane."""
+    """Return centres [V, 3] and headings [V] of boxes whose rears are where their lanes begin, or a little ahead."""
     place, heading = np.zeros((len(lanes), 3)), np.zeros(len(lanes))
     for k, lane in enumerate(lanes.tolist()):
         line, arc = log.road.lanes[lane].astype(np.float64), graph.arc[lane]

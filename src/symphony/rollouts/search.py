@@ -60,7 +60,7 @@ def _settings(env: DrivingEnv, rule: PruningRule | Backtrack, also: Sequence[Any
 
 
 def pruning_rule(config: SearchConfig) -> PruningRule:
-    """Which branches go on."""
+    """Return the rule that decides which branches go on."""
     if config.rule == "best":
         return KeepBest(0.5)
     if config.rule == "systematic":
@@ -69,24 +69,24 @@ def pruning_rule(config: SearchConfig) -> PruningRule:
 
 
 def flag_score(state: TensorDictBase) -> Float[Tensor, "*b N"]:
-    """Score [..., N] of an oracle: 1 where an agent collides or is off the road."""
+    """Return the score [..., N] of an oracle: 1 where an agent collides or is off the road."""
     bad = state.get(keys.COLLISION) | state.get(keys.OFFROAD)
     return (bad.squeeze(-1) & state.get(keys.VALID)).float()
 
 
 def no_score(state: TensorDictBase) -> Float[Tensor, "*b N"]:
-    """Score [..., N] of a search by the value of states alone, or of none."""
+    """Return the score [..., N], all 0, of a search by the value of states alone, or without a score."""
     return torch.zeros_like(state.get(keys.STATE)[..., 0])
 
 
 def no_value(state: TensorDictBase) -> Float[Tensor, "*b"]:
-    """Value [...] of states that are all worth the same."""
+    """Return the same value [...] for all states."""
     return no_score(state)[..., 0]
 
 
 def rule_score(env: DrivingEnv, state: TensorDictBase) -> Float[Tensor, "*b N"]:
-    """Score [..., N] of a rule: 1 where an agent collides, is off the road, or would within :data:`AHEAD` collide,
-    observed or not, were everyone to keep speed and course.
+    """Return the score [..., N] of a rule: 1 where an agent collides, is off the road, or would collide within
+    :data:`AHEAD`, observed or not, if all kept speed and course.
     """
     there, row = state.get(keys.VALID), state.get(keys.SCENE).flatten()
     moves, real = (state.get(key).flatten(0, state.ndim - 1) for key in (keys.STATE, keys.VALID))
@@ -104,8 +104,8 @@ def realism_score(
     score: Score = "discriminator",
     planned: int = 0,
 ) -> Callable[[TensorDictBase], Tensor]:
-    """A function that scores states [..., N], by the discriminator or by what agents do; 0 for background agents, and
-    for so many first agents, which are planned.
+    """Return a function that scores states [..., N], by the discriminator or by what agents do; 0 for background
+    agents and the first ``planned`` agents.
     """
     learned = KeyScore(keys.SCORE, discriminator, valid_key=keys.VALID) if score == "discriminator" else None
 
@@ -121,7 +121,7 @@ def realism_score(
 
 
 def branched_streams(start: TensorDictBase) -> TensorDictBase:
-    """A start state [*b, S] whose branches each have a stream of random numbers of their own."""
+    """Return a start state [*b, S] whose branches each have a stream of random numbers of their own."""
     slot = torch.arange(start.shape[-1], device=start.device)[:, None]
     return start.set(keys.STREAM, fold_in(start.get(keys.STREAM), slot))
 
@@ -133,8 +133,8 @@ def with_drawn_goals(
     seed: int,
     goals_per: Literal["tree", "branch"] = "tree",
 ) -> TensorDictBase:
-    """Start states [*b, S] of a search, with :func:`branched_streams` and routes that the goal policy draws: once for
-    all branches of a tree (paper, section IV-B), or for each branch alone.
+    """Return start states [*b, S] of a search, with :func:`branched_streams` and routes that the goal policy draws:
+    once for all branches of a tree (paper, section IV-B), or for each branch alone.
     """
     start = branched_streams(start)
     first = start if goals_per == "branch" else start[..., :1]
@@ -143,8 +143,8 @@ def with_drawn_goals(
 
 
 def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
-    """Numbers [*b, P] for the rule from a start state [*b, S]: those of the tree's first branch, told apart from its
-    actions'.
+    """Return numbers [*b, P] for the rule from a start state [*b, S]: those of the tree's first branch, told apart
+    from its actions'.
     """
 
     def noise(start: TensorDictBase, periods: int) -> Float[Tensor, "*b P"]:
@@ -162,9 +162,9 @@ def collector_settings(
     segments: int,
     rule: PruningRule | None = None,
 ) -> dict[str, Any]:
-    """Settings that a collector of driving needs beside environment, policy and scores: whole trees of so many run
-    segments at a time, random numbers that depend on nothing but seed, segment, branch and step. ``rule`` prunes, by
-    default the configured one.
+    """Return settings that a collector of driving needs beside environment, policy and scores: whole trees of
+    ``segments`` run segments at a time, random numbers that depend on nothing but seed, segment, branch and step.
+    ``rule`` prunes, by default the configured one.
     """
     return {
         "branches": config.branches,
@@ -194,11 +194,11 @@ def search(
     value: Callable[[TensorDictBase], Tensor] | None = None,
     **returned: Any,
 ) -> BeamSearchResult:
-    """Beam search from a start state [..., S], all branches of a tree, to the last logged step. Scenes beside each
-    other change nothing.
+    """Run a beam search from a start state [..., S], all branches of a tree, to the last logged step. Other scenes of
+    the batch change nothing.
 
     It prunes every T_p steps by :func:`realism_score`, or by a ``value`` of states alone. It keeps of every step what
-    it takes to observe its states anew, and what is named in ``also``; what is returned are settings of
+    it takes to observe its states again, and what is named in ``also``; ``returned`` are settings of
     :func:`symphony.collectors.beam_search`.
     """
     steps = env.decisions
@@ -224,8 +224,8 @@ def search(
 def going_back(
     env: DrivingEnv, threshold: float, lines: int, begin: Callable[[TensorDictBase], TensorDictBase]
 ) -> Backtrack:
-    """The rule by which lines go back in the driving environment, with random numbers of their own at every try, and
-    at the first states [R, 1] with goals that ``begin`` draws anew: those kept may not be met by anybody.
+    """Return the rule by which lines go back in the driving environment, with random numbers of their own at every
+    try, and at the first states [R, 1] with goals that ``begin`` draws again: the kept ones may be out of reach.
     """
 
     def renew(state: TensorDictBase, attempt: Int[Tensor, " R"]) -> TensorDictBase:

@@ -32,7 +32,7 @@ _NEVER = 1 << 30
 class Rollouts(NamedTuple):
     """Rollouts of the interactive agents: states x, y, heading, speed, the first one included; collisions (see
     :func:`between_states` for those between states) and time off the road after each of T steps; and which of these
-    are evaluated: of real agents while they are there, up to the segment's last logged step.
+    are evaluated: of real agents while they are present, up to the segment's last logged step.
     """
 
     state: Float[Tensor, "*b T+1 N 4"]
@@ -41,7 +41,7 @@ class Rollouts(NamedTuple):
     counted: Bool[Tensor, "*b T N"]
 
     def cpu(self) -> Rollouts:
-        """The rollouts on the CPU."""
+        """Return the rollouts on the CPU."""
         return Rollouts(*(part.cpu() for part in self))
 
 
@@ -74,11 +74,11 @@ def simulate(
 def draw_goals(
     env: DrivingEnv, goals: TensorDictModuleBase, start: TensorDictBase, seed: int, tree: Int[Tensor, "*b"]
 ) -> Int[Tensor, "*b N"]:
-    """The route [..., N] that the goal policy draws for each agent from a start state, -1 for none; ``tree`` is the
-    number of the draw within its scene.
+    """Return the route [..., N] that the goal policy draws for each agent from a start state, -1 for none; ``tree``
+    is the number of the draw within its scene.
 
-    In open traffic, agents that enter later draw as if all of them were there already; past the log, where nobody
-    knows who will be, as if nobody else were.
+    In open traffic, agents that enter later draw as if all were present already; past the log, where that is unknown,
+    as if alone.
     """
     noise = _drawn(env, start.get(keys.SCENE), seed, Stream.GOALS, tree)
 
@@ -108,7 +108,7 @@ class RouteGoals(Transform):
     Args:
         goals: a goal policy, such as an agent's ``goals``, or another module that reads ``ROUTES`` and
             ``ROUTES_MASK`` and writes ``GOAL``; by default agents follow the routes nearest to the log.
-        seed: of what is drawn, beside the rollout's identity.
+        seed: of the draws, beside the rollout's identity.
 
     Raises:
         ConfigError: on reset, if the scenes come without routes.
@@ -132,7 +132,7 @@ class RouteGoals(Transform):
 def _drawn(
     env: DrivingEnv, scene: Int[Tensor, "*b 1"], seed: int, use: Stream, number: Int[Tensor, "*b"]
 ) -> Float[Tensor, "*b N"]:
-    """A number for each agent, of a use and a draw within the scene."""
+    """Return a number for each agent, of a use and a draw within the scene."""
     stream = fold_in(fold_in(env.scenes.stream[scene], use), number[..., None])
     return uniform(seed, fold_in(stream, torch.arange(env.num_agents, device=scene.device)), 0)
 
@@ -148,7 +148,7 @@ def start_states(
     goals_per: Literal["tree", "branch"] = "tree",
     fix: Callable[[Tensor, Tensor], Tensor] = lambda scene, goal: goal,
 ) -> TensorDictBase:
-    """First states [B, trees, branches] of all scenes, observed once they have their goals.
+    """Return first states [B, trees, branches] of all scenes, observed once they have their goals.
 
     Goals are drawn by the goal policy, if there is one, or nearest to the log: once for a tree (paper, section IV-B),
     or for each branch. ``fix`` gives those that agents follow, from rows [*b] of the scenes and these goals [*b, N].
@@ -170,7 +170,7 @@ def start_states(
 
 
 def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDictBase) -> Rollouts:
-    """The rollouts that the evaluator reads, from leaves [..., L, T] of a search from ``start`` [..., S], S >= L."""
+    """Return the rollouts that the evaluator reads, from leaves [..., L, T] of a search from ``start`` [..., S]."""
     start, after = start[..., : trajectories.shape[-2]], trajectories.get("next")
     state = torch.cat([start.get(keys.STATE)[..., None, :, :], after.get(keys.STATE)], -3)
     collision, offroad = (after.get(key).squeeze(-1) for key in (keys.COLLISION, keys.OFFROAD))
@@ -178,13 +178,13 @@ def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDict
 
 
 def _counted(env: DrivingEnv, start: TensorDictBase, there: Tensor) -> Bool[Tensor, "*b T N"]:
-    """The steps after which agents are there [..., T, N] and their segment still has logged steps."""
+    """Return the steps after which agents are present [..., T, N] and their segment still has logged steps."""
     step = start.get(keys.STEP) + torch.arange(1, there.shape[-2] + 1, device=start.device)
     return (step <= env.scenes.last_step[start.get(keys.SCENE)])[..., None] & there
 
 
 def existing(scenes: SceneBatch, rollouts: Rollouts) -> Bool[Tensor, "B K T+1 N"]:
-    """Which driven agents of rollouts [B, K, ...] are there at each state."""
+    """Return which driven agents of rollouts [B, K, ...] are present at each state."""
     first = (scenes.interactive_valid & (scenes.enter == 0))[:, None, None]
     return torch.cat([first.expand(-1, rollouts.counted.shape[1], 1, -1), rollouts.counted], -2)
 
@@ -192,8 +192,8 @@ def existing(scenes: SceneBatch, rollouts: Rollouts) -> Bool[Tensor, "B K T+1 N"
 def between_states(
     scenes: SceneBatch, state: Float[Tensor, "B K T+1 N 4"], there: Bool[Tensor, "B K T+1 N"]
 ) -> Bool[Tensor, "B K T N"]:
-    """Whether the box of each driven agent, where it is there, overlaps another's at some time of each step (see
-    :func:`symphony.metrics.collisions`), among all others of its scene as they were driven or logged.
+    """Return whether the box of each driven agent, where it is present, overlaps another's at some time of each step
+    (see :func:`symphony.metrics.collisions`), among all others of its scene as they were driven or logged.
     """
     steps, count = state.shape[2], scenes.log_state.shape[2]
     subject = torch.where(scenes.interactive_valid, scenes.interactive, -1)
@@ -220,8 +220,8 @@ def between_states(
 
 
 class NotFiniteError(SymphonyError):
-    """A network put out a number that is not finite, first for some agent (the ego is 0) of a row of the scenes at
-    some step; comparisons with NaN would choose in silence.
+    """A network returned a number that is not finite, first for some agent (the ego is 0) of a row of the scenes at
+    some step; comparisons with NaN would choose silently.
     """
 
     def __init__(self, what: str, row: int, step: int, agent: int, name: str = "") -> None:
@@ -234,15 +234,15 @@ class NotFiniteError(SymphonyError):
         return f"{where}the {what} put out a number that is not finite for agent {agent} at step {step}"
 
     def named(self, segment: str) -> NotFiniteError:
-        """The same error, with the segment's name."""
+        """Return the same error, with the segment's name."""
         what, row, step, agent, _ = self.args
         return NotFiniteError(what, row, step, agent, segment)
 
 
 class NaNGuard(TensorDictModuleBase):
-    """A module that remembers in which scenes, and when first, a guarded entry [*b, N, ...] that it put out was not
-    finite for a valid agent; looked at once, at the end, so that no step waits for the device. One that scores sees
-    the last state of a scene, too; past a scene's end there is only padding.
+    """A module that remembers in which scenes, and when first, a guarded entry [*b, N, ...] that it wrote was not
+    finite for a valid agent; read once, at the end, so that no step waits for the device. One that scores sees the
+    last state of a scene, too; past a scene's end there is only padding.
     """
 
     def __init__(

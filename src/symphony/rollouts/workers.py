@@ -1,4 +1,4 @@
-"""Run segments, shared among processes."""
+"""Sharing of run segments among processes."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ Work = Callable[[T], R]
 
 
 def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) -> int:
-    """Run segments to simulate at a time: as many as the configuration says, by default up to ``TOGETHER``, as a step
-    of few agents costs little less than one of many; fewer if they see more than ``POINTS``. On a card up to
-    ``FULL``, fewer if its free memory has less than ``BYTES`` for each point that they see.
+    """Return how many run segments to simulate at a time: as many as the configuration says, by default up to
+    ``TOGETHER``, as a step of few agents costs little less than one of many; fewer if they see more than ``POINTS``.
+    On a card up to ``FULL``, fewer if its free memory has less than ``BYTES`` for each point that they see.
     """
     if config.batch:
         return config.batch
@@ -53,15 +53,15 @@ def segments_together(agent: Agent, config: EvaluateConfig, interactive: int) ->
 
 
 def settled(config: EvaluateConfig, dataset: SceneDataset, searches: int) -> EvaluateConfig:
-    """The configuration of so many searches (or batches of rollouts) with its choice whether to compile made, for
-    which batches of the dataset are padded to few shapes.
+    """Return the configuration with its choice whether to compile this many searches (or batches of rollouts) made,
+    for which batches of the dataset are padded to few shapes.
     """
     dataset.few_shapes = compiles(config.compile, config.device, searches)
     return dataclasses.replace(config, compile="yes" if dataset.few_shapes else "no")
 
 
 def batches(items: Sequence[int], size: int, config: EvaluateConfig) -> list[list[int]]:
-    """Items in their order, so many at a time, by default so few that each of several workers gets two batches."""
+    """Return items in order, ``size`` at a time, by default so few that each of several workers gets two batches."""
     if config.workers > 1 and not config.batch:
         size = max(1, min(size, -(-len(items) // (2 * config.workers))))
     if config.compile == "yes" and items:  # as equal as can be, since each size is a program
@@ -72,8 +72,8 @@ def batches(items: Sequence[int], size: int, config: EvaluateConfig) -> list[lis
 def shared(
     work: Work[T, R], tasks: Iterable[T], config: EvaluateConfig, dataset: SceneDataset | None = None
 ) -> Generator[R, None, None]:
-    """The results of some work on every task, in the order of the tasks, by ``config.workers`` processes; one local
-    worker is this very process. ``close`` ends the others. With a dataset, tasks are a list of batches of its items.
+    """Yield the results of some work on every task, in the order of the tasks, by ``config.workers`` processes; one
+    local worker is this process. ``close`` ends the others. With a dataset, tasks are a list of batches of its items.
 
     Raises:
         ConfigError: the work can't be sent to another process, or Ray is not installed.
@@ -103,7 +103,7 @@ def shared(
 
 @contextmanager
 def naming(dataset: SceneDataset, items: Sequence[int]) -> Iterator[None]:
-    """Errors inside name the run segment they are about, unexpected ones all that are at hand."""
+    """Make errors inside name the run segment they are about, unexpected ones all of the items."""
     try:
         yield
     except NotFiniteError as error:
@@ -122,7 +122,7 @@ def _names(dataset: SceneDataset, items: Sequence[int]) -> str:
 
 @lru_cache(1)
 def _opened(sent: bytes) -> Work[Any, Any]:
-    """The work, once per process: it keeps what it prepared from one task to the next."""
+    """Return the work, once per process: it keeps what it prepared from one task to the next."""
     allocator.tune()  # this process is ours
     return cast("Work[Any, Any]", pickle.loads(sent))  # noqa: S301  (from our own parent)
 

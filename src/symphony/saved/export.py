@@ -31,7 +31,7 @@ _COLORS = {"STOP": "red", "CAUTION": "yellow", "GO": "green"}
 
 
 def commonroad(saved: SavedRollouts, rollout: int) -> str:
-    """A rollout as a CommonRoad scenario.
+    """Return a rollout as a CommonRoad scenario.
 
     Agents are dynamic obstacles with their ids of the source (all shifted alike if some are not positive), others for
     each further stretch of steps at which they are seen. Lanelets are nominally wide where the log does not say, and
@@ -190,7 +190,7 @@ class _Network:
 
 
 def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
-    """A rollout for JSON: agents with states (step, x, y, heading, speed), routes and events, lights, and the map."""
+    """Return a rollout for JSON: agents with states (step, x, y, heading, speed), routes, events, lights, map."""
     segment, world, origin = saved.segment, world_of(saved, rollout), saved.segment.origin[:2]
     place = world.position + origin
     agents = []
@@ -223,5 +223,5 @@ def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
 
 
 def as_json(saved: SavedRollouts, rollout: int) -> str:
-    """:func:`to_dict` as text."""
+    """Return :func:`to_dict` as text."""
     return json.dumps(to_dict(saved, rollout), ensure_ascii=False, allow_nan=False) + "\n"

@@ -64,7 +64,7 @@ class About:
     def of(
         cls, agent: str, store: SegmentStore, settings: Mapping[str, Any], *, seed: int = 0, planner: str = ""
     ) -> About:
-        """The facts of rollouts of one agent beside log playback, and of a planner of the ego, if there is one."""
+        """Return the facts of rollouts of one agent beside log playback, and of a planner of the ego, if any."""
         drivers = {"interactive": agent, "others": "playback"}
         if planner:
             agent, drivers = f"{planner} among {agent}", {"ego": planner, **drivers}
@@ -86,7 +86,7 @@ class Entry:
 
 
 class RolloutWriter(AbstractContextManager["RolloutWriter"]):
-    """Adds segments to a folder of rollouts, each on record once :meth:`add` returns; a DataError if the folder holds
+    """Adds segments to a folder of rollouts, each stored once :meth:`add` returns; a DataError if the folder holds
     something else or rollouts of another simulation, or another process writes it.
     """
 
@@ -132,7 +132,7 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
         self.close()
 
     def has(self, segment_id: str) -> bool:
-        """Whether the rollouts of that segment are there."""
+        """Return whether the rollouts of that segment are in the folder."""
         return segment_id in self._entries and self._entries[segment_id].failed is None
 
     def add(self, saved: SavedRollouts) -> None:
@@ -149,7 +149,7 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
         self._record(Entry(name, saved.rollouts, file, hashlib.sha256(data).hexdigest(), saved.segment.dt))
 
     def fail(self, segment_id: str, rollouts: int, reason: str, group: str = "") -> None:
-        """Put on record that a segment could not be simulated; it is tried again when the folder is continued."""
+        """Record that a segment could not be simulated; it is tried again when the folder is continued."""
         self._record(Entry(segment_id, rollouts, failed=reason, group=group))
 
     def _record(self, entry: Entry) -> None:
@@ -179,7 +179,7 @@ class RolloutFolder:
         self.failures = [entry for entry in found if entry.failed is not None]
 
     def only(self, segments: Iterable[str]) -> RolloutFolder:
-        """The folder with some of its segments only."""
+        """Return the folder with some of its segments only."""
         wanted, found = set(segments), copy.copy(self)
         found.entries = [entry for entry in self.entries if entry.segment in wanted]
         found.failures = [entry for entry in self.failures if entry.segment in wanted]
@@ -208,14 +208,14 @@ class RolloutFolder:
         return [entry.segment for entry in self.entries]
 
     def of(self, segment_id: str) -> SavedRollouts:
-        """The rollouts of a segment, by its id; a DataError if there are none."""
+        """Return the rollouts of a segment, by its id; a DataError if there are none."""
         if segment_id not in self.ids:
             raise DataError("no rollouts of this segment", file=self.path, segment=segment_id)
         return self[self.ids.index(segment_id)]
 
 
 def save_rollouts(path: str | Path, about: About, found: Iterable[SavedRollouts]) -> RolloutFolder:
-    """Write rollouts of segments by a :class:`RolloutWriter`; those that are there already are passed over."""
+    """Write rollouts of segments by a :class:`RolloutWriter`; those that exist already are skipped."""
     with RolloutWriter(path, about) as writer:
         for saved in found:
             if not writer.has(saved.segment.segment_id):
@@ -228,7 +228,7 @@ load_rollouts = RolloutFolder
 
 
 def file_stem(segment_id: str) -> str:
-    """A name for files of a segment: safe on any system, another one for every segment."""
+    """Return a name for files of a segment: safe on any system, and different for every segment."""
     name, digest = quote(segment_id, safe=""), hashlib.sha256(segment_id.encode()).hexdigest()
     return name if len(name) <= 120 else f"{name[:103]}-{digest[:16]}"
 
@@ -247,7 +247,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 
 def _read_index(path: Path) -> dict[str, Entry]:
-    """Entries by segment; a later one takes the place of an earlier one. A line that was cut short is left out."""
+    """Return entries by segment; a later one replaces an earlier one. A line that was cut short is left out."""
     file = path / INDEX
     if not file.is_file():
         raise DataError("is missing", file=file)
@@ -269,7 +269,7 @@ def _read_index(path: Path) -> dict[str, Entry]:
 
 
 def tensors_of(saved: SavedRollouts) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """All arrays of a file by name, and what JSON holds beside them."""
+    """Return all arrays of a file by name, and what JSON holds beside them."""
     segment, trees = saved.segment, saved.trees
     arrays: dict[str, NDArray[Any]] = {}
     for prefix, part in (("", saved), ("log.", segment), ("road.", segment.road), ("tree.", trees)):
@@ -289,7 +289,7 @@ def tensors_of(saved: SavedRollouts) -> tuple[dict[str, NDArray[Any]], dict[str,
 
 
 def read_tensors(data: bytes, file: Path, segment_id: str) -> SavedRollouts:
-    """Saved rollouts from the bytes of their file; a DataError names the segment and the field that is wrong."""
+    """Return saved rollouts from the bytes of their file; a DataError names the segment and the wrong field."""
     try:
         arrays = load(data)
         header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])  # after its length as 8 bytes

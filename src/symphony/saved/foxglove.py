@@ -21,7 +21,7 @@ MAST = np.array([0, 0, 4])  # from a stop point to the light that is shown
 
 
 def mcap(saved: SavedRollouts, rollout: int) -> bytes:
-    """A rollout as an MCAP file: the map, and at each state the boxes, the lights and where the ego is.
+    """Return a rollout as an MCAP file: the map, and at each state the boxes, the lights and where the ego is.
 
     ``/map`` and ``/traffic`` are ``foxglove.SceneUpdate``, ``/tf`` is ``foxglove.FrameTransforms``. Entities are in
     the frame ``segment``, whose place in ``source`` is the segment's origin; another is ``ego``. Time begins at 0. At

@@ -17,9 +17,9 @@ HEIGHT = 1.6  # metres, of those whose height is not known
 
 
 def openscenario(saved: SavedRollouts, rollout: int) -> str:
-    """A rollout as an OpenSCENARIO scenario, whose agents follow trajectories of timed poses.
+    """Return a rollout as an OpenSCENARIO scenario, whose agents follow trajectories of timed poses.
 
-    An agent has an event for each stretch of steps at which it is there, and is invisible otherwise. Entities are
+    An agent has an event for each stretch of steps at which it is present, and is invisible otherwise. Entities are
     named by their ids in the source, the ego is ``Ego``. The road network is the OpenDRIVE file that the source was
     made of, by its name, or none. Its lights run their own programs: no log knows the ids of its signals.
     """

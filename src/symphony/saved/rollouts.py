@@ -1,4 +1,4 @@
-"""Rollouts as they are kept on disk: what was simulated and the log it began in, complete without the store.
+"""Rollouts as kept on disk: what was simulated and the log it began in, complete without the store.
 
 Shapes of one run segment: K rollouts, N driven agents, A agents of the log, T simulated steps; of its search trees,
 R trees, S branches, P periods between prunings, L leaves. World frame of the segment, SI units.
@@ -36,7 +36,7 @@ class SavedTrees:
 
     Attributes:
         state: [R, S, T, N, 4] x, y, heading, speed after each step, by the slot that simulated it.
-        there: [R, S, T, N] whether the agent is there then, as are ``collision`` and ``offroad``.
+        there: [R, S, T, N] whether the agent is present then; ``collision`` and ``offroad`` are alike.
         score: [R, S, T, N] of those states, high is bad; NaN where there is none.
         totals: [R, P, S] what the pruning after each period compared.
         parents: [R, P, S] after period p slot s was continued from slot ``parents[p, s]``.
@@ -63,16 +63,16 @@ class SavedRollouts:
         segment: the log, its map and its lights.
         agents: [N] rows of the log that were driven; all others play back the log.
         state: [K, T + 1, N, 4] x, y, heading, speed, the first state included.
-        counted: [K, T, N] steps at which an agent is there, up to the end of a rollout that failed; of the same shape
-            are ``collision`` and ``offroad``.
+        counted: [K, T, N] steps at which an agent is present, up to the end of a rollout that failed; of the same
+            shape are ``collision`` and ``offroad``.
         goal: [K, N] line of ``routes`` that an agent followed, -1 for none.
         routes: points of the routes; z is 0.
         start: step of the log at which the first state lies.
         drivers: [N] who drove each agent.
         failed: reason why a rollout broke off, by its number; its later steps don't count.
         trees: the searches, where they are kept.
-        plan: [K, P, T, H, 2] points that the planners of the first P agents meant to come past, NaN for none; None if
-            none ever said.
+        plan: [K, P, T, H, 2] points that the planners of the first P agents meant to pass, NaN for none; None if none
+            ever said.
     """
 
     segment: RunSegment
@@ -91,45 +91,45 @@ class SavedRollouts:
 
     @property
     def there(self) -> NDArray[np.bool_]:
-        """[K, T + 1, N] who is there at each state: at the first one where the second counts and the log has them."""
+        """[K, T + 1, N] who is present at each state: at the first if the second counts and the log has them."""
         first = self.counted[:, :1] & self.segment.valid[self.agents, self.start]
         return np.concatenate([first, self.counted], 1)
 
     def logged(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """[rows, T + 1] where the log has agents at the simulated states."""
+        """Return [rows, T + 1] where the log has agents at the simulated states."""
         within = np.arange(self.start, self.last + 1)
         return self.segment.valid[rows][:, within] & (within < self.segment.log_steps)
 
     @cached_property
     def log_height(self) -> NDArray[np.float32]:
-        """See :func:`symphony.data.levels.agent_heights`."""
+        """The height and level of logged agents, see :func:`symphony.data.levels.agent_heights`."""
         return agent_heights(self.segment)
 
     @property
     def evaluated(self) -> NDArray[np.int64]:
-        """Places among the N driven agents of those that are no background."""
+        """The places among the N driven agents of those that are not background."""
         named = self.drivers or ("",) * len(self.agents)
         return np.flatnonzero([not name.startswith(BACKGROUND) for name in named])
 
     @property
     def rollouts(self) -> int:
-        """Number of rollouts, K."""
+        """The number of rollouts, K."""
         return len(self.state)
 
     @property
     def steps(self) -> int:
-        """Number of simulated steps, T."""
+        """The number of simulated steps, T."""
         return self.state.shape[1] - 1
 
     @property
     def last(self) -> int:
-        """Step of the log at which the last state lies."""
+        """The step of the log at which the last state lies."""
         return self.start + self.steps
 
 
 class World(NamedTuple):
-    """Everyone in one rollout, A agents at U states: position [A, U, 2], heading [A, U], velocity [A, U, 2], who is
-    there [A, U], length and width [A, 2], height and level [A, U, 2] (:mod:`symphony.data.levels`) if known.
+    """All agents in one rollout, A agents at U states: position [A, U, 2], heading [A, U], velocity [A, U, 2],
+    presence [A, U], length and width [A, 2], height and level [A, U, 2] (:mod:`symphony.data.levels`) if known.
     """
 
     position: NDArray[np.float64]
@@ -146,7 +146,7 @@ class World(NamedTuple):
 
 
 def world_of(saved: SavedRollouts, rollout: int) -> World:
-    """Everyone in one rollout: driven agents where they were driven, all others as logged."""
+    """Return all agents in one rollout: driven ones where they were driven, all others as logged."""
     segment, agents, within = saved.segment, saved.agents, slice(saved.start, saved.last + 1)
     logged = (segment.position[..., :2], segment.heading, segment.velocity)
     position, heading, velocity = (part[:, within].astype(np.float64) for part in logged)
@@ -179,7 +179,7 @@ def saved_rollouts(
     failed: Mapping[int, str] | None = None,
     plan: NDArray[np.float32] | None = None,
 ) -> SavedRollouts:
-    """The rollouts [B, K, ...] of one run segment, in a row of B scenes, ready to be written; with the goals
+    """Return the rollouts [B, K, ...] of one run segment, in a row of B scenes, ready to be written; with the goals
     [B, K, N], the search [B, R] of which they are the leaves, the driver of all interactive agents, or of each, who
     drives the background agents (``others``), why rollouts failed, by number, and what planners meant (``plan``).
     """
@@ -201,7 +201,7 @@ def _array(part: Tensor) -> NDArray[Any]:
 
 
 def _routes(scenes: SceneBatch, row: int, goal: Tensor | None, rollouts: int) -> tuple[NDArray[np.int64], Polylines]:
-    """Goals [K, N] as numbers of the distinct routes that some rollout follows, and these."""
+    """Return goals [K, N] as numbers of the distinct routes that some rollout follows, and these routes."""
     agents = scenes.interactive.shape[1]
     chosen = np.full((rollouts, agents), -1) if goal is None else _array(goal[row])
     place = np.broadcast_to(np.arange(agents), chosen.shape)

@@ -45,17 +45,17 @@ def save_simulation(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RolloutFolder:
     """Simulate an agent on every run segment of a dataset, which has routes if there are goals or a planner, and keep
-    the rollouts, and on demand all branches of the search, in a folder. What was cut short goes on where it stopped.
+    the rollouts, and on demand all branches of the search, in a folder. An interrupted one goes on where it stopped.
 
     A planner (see :func:`symphony.planners.interface.planner_maker`) drives the ego, others those that they are to
     drive, by the ids that the dataset has ``also`` (:class:`symphony.rollouts.crowd.Crowd`), the agent the other
     interactive agents, without a search unless one is asked for. More than ``planner_seconds`` for an answer fails
-    the run. Segments in which a planner has nobody to drive are put on record as failed. Goals are those of
+    the run. Segments in which a planner has no agent to drive are recorded as failed. Goals are those of
     :func:`symphony.rollouts.control.given_goals`. ``progress`` is called with the segments done and their total.
 
     Raises:
         DataError: the folder holds something else, or the disk refuses.
-        ConfigError: the agent can't be simulated so, or a goal can't be reached.
+        ConfigError: the agent can't be simulated in this way, or a goal can't be reached.
     """
     if drives and not planner:
         raise ConfigError("others can have a planner only beside one of the ego (`log` plays back its log)")
@@ -95,7 +95,7 @@ def _drive(
     goals: Sequence[str],
     items: list[int],
 ) -> list[SavedRollouts]:
-    """Rollouts of an agent on a batch of run segments, of each, with planners of the first agents, by id."""
+    """Return an agent's rollouts of each run segment of a batch, with planners of the first agents, by id."""
     with naming(dataset, items):
         scenes = dataset.scenes(items).to(torch.device(config.device))
         segments = [dataset.segment(i) for i in items]
@@ -115,7 +115,7 @@ def _drive(
 
 
 def has_ego(writer: RolloutWriter, dataset: SceneDataset, item: int, rollouts: int) -> bool:
-    """Whether the first interactive agent of an item is the ego; else it is put on record as failed."""
+    """Return whether the first interactive agent of an item is the ego; otherwise record it as failed."""
     segment, why = dataset.segment(item), "the ego is no vehicle that is seen at the first step"
     try:
         if int(dataset.scene(item).interactive[0, 0]) == segment.ego:
@@ -127,7 +127,7 @@ def has_ego(writer: RolloutWriter, dataset: SceneDataset, item: int, rollouts: i
 
 
 def plain_settings(config: EvaluateConfig, agent: Agent, interactive: int, duration: float) -> dict[str, Any]:
-    """Settings that change what is simulated, those left to the agent filled in, and digests of weights and spec."""
+    """Return settings that change what is simulated, with the agent's choices filled in, and digests of its files."""
     found = dataclasses.asdict(config)
     found |= {"interactive": config.interactive or interactive, "duration": config.duration or duration}
     found = {name: value for name, value in found.items() if name not in _MEMORY}

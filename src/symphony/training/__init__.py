@@ -1,4 +1,4 @@
-"""The one trainer: loop, resume, alarms, logging, processes, and hooks that validate and show."""
+"""The one trainer: loop, resume, alarms, logging, processes, and hooks that validate and preview."""
 
 from __future__ import annotations
 

@@ -61,11 +61,11 @@ def add_hooks(trainer: Trainer) -> None:
 
 
 class Validator:
-    """Evaluates an agent, whose networks are on a device, as it is at each call and will be used, search included.
+    """Evaluates an agent, whose networks are on a device, as it is at each call and as it will be used, with search.
 
     Attributes:
         best: the best so far; to be set for a run that goes on.
-        what: which segments of what data are simulated how often.
+        what: the segments and the number of their rollouts, in words.
         dataset: these segments.
     """
 
@@ -92,8 +92,8 @@ class Validator:
         self.what = f"{len(chosen)} segments of {store.checksum()}, {config.rollouts} rollouts"
 
     def __call__(self, step: int, progress: Callable[[int, int], None] | None = None) -> dict[str, float]:
-        """The numbers for the record after an update, all beginning with ``validation_``. The best agent is the one
-        whose collision rate plus off-road time is lowest (paper, section V-B).
+        """Return the numbers for the record after an update, all beginning with ``validation_``. The best agent is
+        the one whose collision rate plus off-road time is lowest (paper, section V-B).
         """
         with undisturbed(self.agent, self.device):
             found = evaluate(self.agent, self.dataset, self.how, progress).metrics.compute()
@@ -109,7 +109,7 @@ class Validator:
 
 @contextmanager
 def undisturbed(agent: Agent, device: torch.device) -> Iterator[None]:
-    """Use networks on a device as after training, which goes on as if they had not been used."""
+    """Use networks on a device as after training, which then continues as if they had not been used."""
     modules = agent.modules.values()
     modes = [module.training for module in modules]
     devices = [torch.cuda.current_device()] if device.type == "cuda" else []
@@ -124,8 +124,8 @@ def undisturbed(agent: Agent, device: torch.device) -> Iterator[None]:
 
 
 class Previewer:
-    """Simulates an agent as it is meant to be simulated, on the same run segments of a data set at each call, and
-    shows it in the run's folder ``media``.
+    """Simulates an agent as it will be used, on the same run segments of a data set at each call, and shows it in the
+    run's folder ``media``.
     """
 
     def __init__(
@@ -145,8 +145,8 @@ class Previewer:
         self.how = EvaluateConfig(rollouts=rollouts, device=str(device))
 
     def __call__(self, step: int, tracker: Tracker | None = None) -> dict[str, float]:
-        """Show the agent as it is after an update, in the folder and to a tracker; returns :func:`quantiles` for the
-        record, and raises DataError if the disk refuses.
+        """Show the agent as it is after an update, in the folder and to a tracker; return :func:`quantiles` for the
+        record, and raise DataError if the disk refuses.
         """
         segments, scenes = [self.dataset.segment(i) for i in self.items], self.dataset.scenes(self.items)
         with undisturbed(self.agent, self.device):
@@ -166,7 +166,7 @@ class Previewer:
 
     @torch.no_grad()
     def _scores(self, step: int) -> dict[str, Float[Tensor, " K"]]:
-        """The discriminator's logits [K] of simulated and logged states; which, the number of the update says."""
+        """Return the discriminator's logits [K] of simulated and logged states, drawn by the number of the update."""
         if self.agent.discriminator is None:
             return {}
         if self.replay is None or not self.replay.searched:
@@ -177,7 +177,7 @@ class Previewer:
 
 
 def quantiles(samples: Samples) -> dict[str, float]:
-    """Quantiles of samples for the record, all beginning with ``preview_``; those of nothing are NaN."""
+    """Return quantiles of samples for the record, all beginning with ``preview_``; NaN without samples."""
     found: dict[str, float] = {}
     for name, values in samples.items():
         levels = np.percentile(values, QUANTILES) if len(values) else [np.nan] * len(QUANTILES)
@@ -186,7 +186,7 @@ def quantiles(samples: Samples) -> dict[str, float]:
 
 
 def samples_of(scenes: SceneBatch, rollouts: Rollouts, dt: Sequence[float]) -> Samples:
-    """The motion of interactive agents in rollouts [B, K] of scenes with steps of dt seconds: ``speed`` (m/s),
+    """Return the motion of interactive agents in rollouts [B, K] of scenes with steps of dt seconds: ``speed`` (m/s),
     ``acceleration`` (m/s^2) and ``turn`` (rad/s) at every step, simulated and, in ``speed_log`` etc., logged; ``ade``
     (m) of every segment.
     """
@@ -203,7 +203,7 @@ def samples_of(scenes: SceneBatch, rollouts: Rollouts, dt: Sequence[float]) -> S
 def _motion(
     state: Float[Tensor, "B K U N 4"], valid: Bool[Tensor, "B K T N"], dt: Float[Tensor, "B 1 1 1"]
 ) -> Samples:
-    """The motion of the valid [B, K, T, N] steps to the later of states [B, K, T + 1, N, 4]."""
+    """Return the motion of the valid [B, K, T, N] steps to the later of states [B, K, T + 1, N, 4]."""
     change, speed = state[:, :, 1:] - state[:, :, :-1], state[:, :, 1:, :, 3]
     found = {"speed": speed, "acceleration": change[..., 3] / dt, "turn": wrap(change[..., 2]) / dt}
     return {name: _finite(values[valid]) for name, values in found.items()}

@@ -1,4 +1,4 @@
-"""Curves of a run: always a plain JSON-lines file, and Weights & Biases beside it."""
+"""The curves of a run: always a plain JSON-lines file, and Weights & Biases beside it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Tracker:
         folder: of the run; ``metrics.jsonl`` is written there.
         settings: shown by Weights & Biases beside the curves.
         wandb: ``offline``, ``online`` or ``disabled``; the environment variable ``WANDB_MODE`` overrides it.
-        after: keep only records up to this step of an earlier, interrupted run, which this one goes on with.
+        after: keep only records up to this step of an earlier, interrupted run, which this one continues.
 
     Attributes:
         kept: records of that earlier run.
@@ -102,7 +102,7 @@ class Tracker:
 
 
 def _run_id(folder: Path, *, again: bool) -> str:
-    """The id of a run at Weights & Biases: the same when it goes on, so that its parts become one there."""
+    """Return the id of a run at Weights & Biases: the same when it goes on, so that its parts become one there."""
     path = folder / ID
     known = path.read_text(encoding="utf-8", errors="replace").strip() if again and path.is_file() else ""
     if not re.fullmatch(r"[0-9a-z]{4,32}", known):
@@ -112,7 +112,7 @@ def _run_id(folder: Path, *, again: bool) -> str:
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """The records of a run so far; a line that is none, such as a last one cut short by a kill, is left out."""
+    """Return the records of a run so far; an invalid line, such as a last one cut short by a kill, is left out."""
     path = folder / RECORDS
     if not path.is_file():
         return []

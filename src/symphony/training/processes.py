@@ -54,28 +54,28 @@ class Processes:
 
     @property
     def is_main(self) -> bool:
-        """Whether this is the one that validates, writes and speaks."""
+        """Whether this is the process that validates, writes and prints."""
         return self.rank == 0
 
     def seed(self, seed: int) -> int:
-        """The seed of the data that this process draws, the run's own in the leading one."""
+        """Return the seed of the data that this process draws, the run's own in the leading one."""
         return seed + self.rank * _SEED_STRIDE
 
     def reseed(self, seed: int, step: int) -> None:
-        """Make the global random numbers those of (seed, update, process): a checkpoint holds one process's."""
+        """Seed the global random numbers from (seed, update, process): a checkpoint holds one process's."""
         if self.count > 1:
             torch.manual_seed(stream_of(f"update {seed} {self.rank} {step}"))
 
     def wrap_ddp(self, loss: MaskedLoss) -> MaskedLoss | SharedLoss:
-        """A loss that is that of the batches of all processes; itself where there is one process only."""
+        """Return a loss over the batches of all processes; the loss itself if there is only one process."""
         if self.count == 1:
             return loss
         loss.share_count = self._mean
         return SharedLoss(loss)
 
     def mean(self, values: Mapping[str, Num[Tensor, ""]]) -> dict[str, Num[Tensor, ""]]:
-        """Means over the processes of numbers under the same names, NaN left out: of what a loss reports exactly its
-        value on the joint batch, of AUCs and what searches report the mean of the processes' own.
+        """Return means over the processes of numbers under the same names, NaN left out: of what a loss reports
+        exactly its value on the joint batch, of AUCs and what searches report the mean of the processes' own.
         """
         if self.count == 1 or not values:
             return dict(values)
@@ -88,7 +88,7 @@ class Processes:
         return dict(zip(names, (total / number).unbind(), strict=True))
 
     def wait(self) -> None:
-        """Go on when all have got here."""
+        """Wait until all processes have got here."""
         if self.count > 1:
             # A reduction, as a barrier of NCCL guesses the device.
             dist.all_reduce(torch.zeros((), device=self.device))
@@ -101,7 +101,7 @@ class Processes:
 
 @contextmanager
 def processes(device: torch.device) -> Iterator[Processes]:
-    """The processes that ``torchrun`` started or that have a group; else this one. ConfigError without a card."""
+    """Give the processes that ``torchrun`` started or that have a group; else this one. ConfigError: no card."""
     begun = dist.is_available() and dist.is_initialized()
     own = dist.is_available() and not begun and dist.is_torchelastic_launched()
     if not own and not begun:

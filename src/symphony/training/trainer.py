@@ -1,4 +1,4 @@
-"""The one trainer: runs what a recipe has built, from its last checkpoint, from another run's networks, or anew."""
+"""The one trainer: runs what a recipe has built, from its last checkpoint, another run's networks, or scratch."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Phase:
 
 
 def cosine(rates: Mapping[str, float], end: int, begin: int = 0) -> Rates:
-    """Rates that fall to a tenth along a cosine, from update ``begin`` to ``end``."""
+    """Return rates that fall to a tenth along a cosine, from update ``begin`` to ``end``."""
 
     def at(step: int) -> Mapping[str, float]:
         share = 0.5 * (1 + math.cos(math.pi * (step - begin) / (end - begin)))
@@ -104,13 +104,13 @@ class TrainingError(SymphonyError):
 
 @dataclass
 class Skips:
-    """How many steps of optimizers were left out because the gradient was not finite, of each network in a row."""
+    """The number of optimizer steps of each network in a row that were left out for a gradient that is not finite."""
 
     total: int = 0
     in_row: dict[str, int] = field(default_factory=dict)
 
     def count(self, values: Mapping[str, Tensor]) -> list[str]:
-        """Count those of one update, from its norms of the gradient; returns the networks concerned, and raises
+        """Count the skips of one update, from its gradient norms; return the networks concerned, and raise
         TrainingError if one had to skip too many in a row.
         """
         norms = {name.removeprefix(NORM): value for name, value in values.items() if name.startswith(NORM)}
@@ -140,7 +140,7 @@ class Alarms:
             self.check(record)
 
     def check(self, record: Mapping[str, Any]) -> str | None:
-        """The alarm (see :data:`ALARMS`) that is on after this record, if any."""
+        """Return the alarm (see :data:`ALARMS`) that is on after this record, if any."""
         value = record.get("discriminator_auc")
         if value is None or math.isnan(value):
             return None
@@ -153,7 +153,7 @@ class Alarms:
 
 
 class Validation(Protocol):
-    """A hook that evaluates the agent as it is after an update; gives numbers for the record."""
+    """A hook that evaluates the agent after an update and returns numbers for the record."""
 
     best: Best | None
     what: str  # the run segments of `dataset` and how often they are simulated: scores of others can't be compared
@@ -169,18 +169,18 @@ Preview = Callable[[int, Tracker], dict[str, float]]
 class Trainer:
     """Runs the updates of a recipe: records, validation, previews and checkpoints, in that order.
 
-    All that is random in an update derives from the seed and the number of the update, and checkpoints hold weights
-    and optimizers, so a run that was stopped and resumed ends with the same weights as one that was not.
+    All randomness in an update derives from the seed and the number of the update, and checkpoints hold weights and
+    optimizers, so a resumed run ends with the same weights as one that was never stopped.
 
     Args:
-        config: of the run; the folder gets it whole.
+        config: of the run; written whole to its folder.
         agent: what learns, on its device.
         data: what it learns from.
         phases: stretches of updates, in their order.
         optimizers: by name; each is stepped on the losses that come under its name.
-        rng: the generator that the updates draw from; seeded anew before each.
+        rng: the generator of all draws of updates; seeded again before each.
         processes: those that train together.
-        replay: what is drawn from searches, where there are any.
+        replay: of searches, where there are any.
 
     Attributes:
         validator: a hook called at every checkpoint, of which the best then is the run's agent.
@@ -236,7 +236,7 @@ class Trainer:
 
         Raises:
             ConfigError: if another process has begun or gone on with the run since this trainer was made.
-            DataError: if another process is at it, or the disk refuses.
+            DataError: if another process trains it, or the disk refuses.
             TrainingError: if gradients stay infinite or undefined.
         """
         with contextlib.ExitStack() as held:
@@ -320,7 +320,7 @@ class Trainer:
                 self._save(step)
 
     def _update(self, step: int) -> dict[str, Tensor]:
-        """One update of every network; what is worth a record, as tensors without gradient."""
+        """Update every network once; return what is worth a record, as tensors without gradient."""
         self.rng.manual_seed(self.seed * _SEED_STRIDE + step)
         self.world.reseed(self.config.seed, step)
         phase = next(phase for phase in self.phases if step < phase.until)
@@ -337,7 +337,7 @@ class Trainer:
         return record
 
     def _descend(self, name: str, losses: TensorDictBase) -> dict[str, Tensor]:
-        """Step the optimizer of a name; its statistics, with the name before those that are no losses."""
+        """Step the optimizer of a name; return its statistics, those that are not losses prefixed with the name."""
         named = {
             key if key.startswith(("loss", name)) else f"{name}_{key}": value.detach()
             for key, value in losses.items()
@@ -358,7 +358,7 @@ class Trainer:
         return {**named, f"loss_{name}": total.detach(), f"{NORM}{name}": norm}
 
     def _describe(self, numbers: Mapping[str, Any]) -> dict[str, float | str]:
-        """Show the numbers of a record; returns what the loop adds to it."""
+        """Show the numbers of a record; return what the loop adds to it."""
         added: dict[str, float | str] = {}
         if "policy" in self.optimizers:
             added["learning_rate"] = self.optimizers["policy"].param_groups[0]["lr"]
@@ -382,7 +382,7 @@ class Trainer:
         self.progress.update(self.task, description=what)
 
     def _save(self, step: int) -> None:
-        """Write a checkpoint; by now all records up to it are on the disk."""
+        """Write a checkpoint; all records up to it are on disk by now."""
         self._lock.check()
         extra = {
             "best": None if self.best is None else dataclasses.asdict(self.best),
@@ -424,7 +424,7 @@ class Trainer:
 
 
 def checkpoint_to_resume(config: RunConfig) -> Path | None:
-    """The checkpoint to go on from; None for a new run. ConfigError if the folder holds a run that is another."""
+    """Return the checkpoint to go on from; None for a new run. ConfigError if the folder holds another run."""
     path, records = config.out / "config.json", config.out / RECORDS
     found = latest(config.out / "checkpoints")
     if path.exists():
@@ -447,7 +447,7 @@ def checkpoint_to_resume(config: RunConfig) -> Path | None:
 
 
 def _changed(before: Any, after: Any, where: str = "") -> list[str]:
-    """Settings that differ, those within others by their full names, with what they were."""
+    """Return the settings that differ, nested ones by their full names, with their old values."""
     found = []
     for name in (item.name for item in dataclasses.fields(after)):
         one, other = getattr(before, name), getattr(after, name)

@@ -1,4 +1,4 @@
-"""The WOSAC score of an agent on any run segments, who goes first there, and the scores of baselines beside it."""
+"""The WOSAC score of an agent on any run segments, the passing order there, and the scores of baselines."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ _TIMED = ("position", "heading", "velocity", "valid", "signal_state")
 
 
 def wosac_window(segment: RunSegment, future: int = FUTURE) -> RunSegment:
-    """The first 9 s of a segment as the challenge has them: 91 steps of 0.1 s, of which step 10 is the current one.
+    """Return the first 9 s of a segment as the challenge has them: 91 steps of 0.1 s, with step 10 the current one.
 
     Other time steps are brought to 0.1 s by :func:`symphony.data.resample.resample`. Of a segment between 8 and 9 s
-    the future is kept whole and the history is shorter: its first steps are valid for nobody, and go back from the
+    the future is kept whole and the history is shorter: its first steps are valid for no agent, and go back from the
     first logged one at its velocity, so that there is no jump in speed. Where the world's origin is more than 100 km
     away, as in maps with UTM coordinates, that of the segment takes its place.
 
-    With fewer steps of the future than 80 all of the above is so much shorter. Raises a :class:`DataError` for less
+    With fewer than 80 steps of the future all of this is shorter by as much. Raises a :class:`DataError` for less
     than 8 s.
     """
     tenth = segment if abs(segment.dt - DT) < 1e-6 else resample(segment, DT)
@@ -76,10 +76,10 @@ def wosac_window(segment: RunSegment, future: int = FUTURE) -> RunSegment:
 
 
 def wosac_scenario(window: RunSegment) -> WosacScenario:
-    """What is scored of a :func:`wosac_window`.
+    """Return the scored part of a :func:`wosac_window`.
 
     Scored are the ego and the agents the source marks for prediction, as far as they are valid at step 10; where it
-    marks none, all agents that are. The road's boundary stands for road edges; lanes and lights are the segment's.
+    marks none, all valid agents. The road's boundary stands for road edges; lanes and lights are the segment's.
     Raises a :class:`DataError` where it can't be scored; names the segment.
     """
     present = window.valid[:, CURRENT]
@@ -110,7 +110,7 @@ def wosac_scenario(window: RunSegment) -> WosacScenario:
 
 
 def log_playback(window: RunSegment) -> SimulatedRollouts:
-    """32 times the log of a :func:`wosac_window`; agents that it does not see are far away from everyone."""
+    """Return 32 copies of the log of a :func:`wosac_window`; agents that it does not see are far from all others."""
     rows, later = np.flatnonzero(window.valid[:, CURRENT]), slice(CURRENT + 1, None)
     place = (window.position[rows, later] + window.origin).astype(np.float64)
     away = np.zeros((len(rows), 1, 3))
@@ -124,14 +124,14 @@ EVERY = 2  # steps of 0.1 s between those at which paths are looked at
 
 
 class PassingGaps(NamedTuple):
-    """Seconds by which the first of each of K pairs is ahead of the second, NaN where their paths don't meet."""
+    """The seconds by which the first of each of K pairs is ahead of the second, NaN where their paths don't meet."""
 
     simulated: Float[Tensor, "R K"]
     log: Float[Tensor, " K"]
 
 
 def passing_pairs(window: RunSegment) -> NDArray[np.int64]:
-    """[K, 2] rows of the vehicles that merge or cross in the log after the current step, both valid at it."""
+    """Return [K, 2] rows of the vehicles that merge or cross in the log after the current step, both valid at it."""
     now = window.current_step
     timed = ("position", "heading", "velocity", "valid", "signal_state")
     future = window.replace(
@@ -147,7 +147,7 @@ def passing_pairs(window: RunSegment) -> NDArray[np.int64]:
 
 
 def passing_gaps(window: RunSegment, pairs: NDArray[np.int64], rollouts: SimulatedRollouts) -> PassingGaps:
-    """Gaps of K pairs of rows [K, 2] (see :func:`passing_pairs`) in rollouts of everyone and in the log."""
+    """Return gaps of K pairs of rows [K, 2] (see :func:`passing_pairs`) in rollouts of all agents and in the log."""
     column = {int(name): k for k, name in enumerate(rollouts.object_id)}
     simulated, log = [torch.zeros(len(rollouts.x), 0)], [torch.zeros(0)]
     for pair in pairs:
@@ -166,7 +166,7 @@ def passing_gaps(window: RunSegment, pairs: NDArray[np.int64], rollouts: Simulat
 
 
 def order_of(found: Sequence[PassingGaps]) -> OrderStatistics:
-    """All pairs of all run segments together."""
+    """Return the order statistics of all pairs of all run segments together."""
     return order_statistics(torch.cat([one[0] for one in found], -1), torch.cat([one[1] for one in found]))
 
 
@@ -176,8 +176,8 @@ vehicles that act at random."""
 
 
 class SegmentResult(NamedTuple):
-    """What was found of an agent on a run segment: its scores (see :func:`symphony.wosac.scorer.score`), who goes
-    first there, and CPU seconds of the simulation.
+    """The result of an agent on a run segment: its scores (see :func:`symphony.wosac.scorer.score`), its passing
+    gaps, and CPU seconds of the simulation.
     """
 
     scores: dict[str, float]
@@ -187,7 +187,7 @@ class SegmentResult(NamedTuple):
 
 @dataclass(frozen=True)
 class WosacEvaluation:
-    """Scores of an agent and of the baselines."""
+    """The scores of an agent and of the baselines."""
 
     config: str  # year of the challenge
     agent: str  # its name
@@ -201,23 +201,23 @@ class WosacEvaluation:
     left_out: list[Skip]  # run segments that can't be scored, and why
 
     def numbers(self, agent: str) -> dict[str, tuple[float, float]]:
-        """Mean of every number over run segments, and its standard error over recordings (NaN for a single one)."""
+        """Return the mean of every number over run segments, and its standard error over recordings (NaN for one)."""
         rows = [one.scores for one in self.results[agent]]
         groups = np.unique(self.groups, return_inverse=True)[1]
         return {name: clustered_mean(np.array([row[name] for row in rows]), groups) for name in rows[0]}
 
     def flat(self, agent: str) -> dict[str, float | None]:
-        """Means, then standard errors with ``_se`` after their names, None where there is none."""
+        """Return means, then standard errors with ``_se`` after their names, None where there is none."""
         numbers = self.numbers(agent)
         errors = {f"{name}_se": None if math.isnan(error) else error for name, (_, error) in numbers.items()}
         return {**{name: mean for name, (mean, _) in numbers.items()}, **errors}
 
     def order(self, agent: str) -> OrderStatistics:
-        """Who goes first, of all pairs of vehicles that merge or cross in the logs."""
+        """Return the passing order of all pairs of vehicles that merge or cross in the logs."""
         return order_of([one.passing for one in self.results[agent]])
 
     def record(self) -> dict[str, Any]:
-        """As JSON can hold it."""
+        """Return the record in types that JSON can hold."""
         agents = {}
         for name, found in self.results.items():
             order = dataclasses.asdict(self.order(name))
@@ -241,7 +241,7 @@ class WosacEvaluation:
 
 
 def wosac_parts(found: WosacEvaluation, record: Mapping[str, Any]) -> dict[str, Any]:
-    """What the score adds to the record of an evaluation of the same agent on the same store (see
+    """Return the additions of the score to the record of an evaluation of the same agent on the same store (see
     :mod:`symphony.evaluation.records`): ``wosac``, all of it; the numbers of the agent with ``wosac_`` before their
     names, and the parts of the baselines with theirs.
     """
@@ -254,7 +254,7 @@ def wosac_parts(found: WosacEvaluation, record: Mapping[str, Any]) -> dict[str, 
 
 
 def simulated_how(agent: Agent, settings: WosacSettings) -> dict[str, Any]:
-    """What decides the rollouts, with what was left to the agent filled in."""
+    """Return the settings that decide the rollouts, with the agent's choices filled in."""
     config = settings.config(ROLLOUTS, settings.seed)
     kind, _, branches, _, pruning = agent.plan(config)
     replaces = kind == "backtrack" or (kind == "tree" and pruning.rule == "replace")
@@ -286,16 +286,16 @@ def evaluate_wosac(
     baselines: bool = True,
     strict: bool = False,
 ) -> WosacEvaluation:
-    """Score an agent on run segments of a store, and beside it :data:`WOSAC_BASELINES`.
+    """Score an agent on run segments of a store, and :data:`WOSAC_BASELINES` beside it.
 
     Takes the numbers of the run segments, which may have any time step, and the year of the challenge. Where
     ``strict`` a run segment that can't be scored (too short, without road edges, vehicles or a future) is an error
     instead of being left out. ``progress`` is called with the segments done and their total.
 
     Raises:
-        ConfigError: no such year, or the agent can't be simulated so.
+        ConfigError: no such year, or the agent can't be simulated in this way.
         DataError: the store is empty, or no segment can be scored; names the first.
-        NotFiniteError: a network of the agent puts out a number that is not finite.
+        NotFiniteError: a network of the agent returns a number that is not finite.
     """
     if config not in CHALLENGES:
         raise ConfigError(f"config must be one of {', '.join(CHALLENGES)}, is {config}")
@@ -332,7 +332,7 @@ def evaluate_wosac(
 
 
 def scorable(store: SegmentStore, items: Sequence[int], future: int = FUTURE) -> None:
-    """See that some run segment can be scored. Raises a :class:`DataError` where none can; names the first."""
+    """Check that some run segment can be scored. Raises a :class:`DataError` where none can; names the first."""
     first: DataError | None = None
     for item in items:
         try:
@@ -345,7 +345,7 @@ def scorable(store: SegmentStore, items: Sequence[int], future: int = FUTURE) ->
 
 
 def _prepared(segment: RunSegment, future: int, config: WosacConfig) -> tuple[RunSegment, WosacScenario]:
-    """The window of a segment and what is scored of it, if it can be."""
+    """Return the window of a segment and its scored part, if it can be scored."""
     window = wosac_window(segment, future)
     scenario = wosac_scenario(window)
     check_scored(scenario, config)
@@ -371,7 +371,7 @@ class _SegmentScorer:
     strict: bool
 
     def __call__(self, items: list[int]) -> _Scored | Skip:
-        """What was found, or why there is nothing."""
+        """Return the scores, or why there are none."""
         segment = self.store[items[0]]
         try:
             window, scenario = _prepared(segment, self.settings.future, CHALLENGES[self.config])

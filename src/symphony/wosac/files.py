@@ -1,4 +1,4 @@
-"""Rollouts that lie in files, made by anyone, and their scores against the scenarios they are of."""
+"""Rollouts in files, made by anything, and their scores against the scenarios that they belong to."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ Packed = tuple[Path, int, bytes, Path]
 
 
 def read_rollouts(file: Path) -> scorer.SimulatedRollouts:
-    """Read an ``.npz`` with ``object_id`` [n] and ``x``, ``y``, ``z``, ``heading`` [R, n, 80]; more is left alone.
+    """Read an ``.npz`` with ``object_id`` [n] and ``x``, ``y``, ``z``, ``heading`` [R, n, 80]; more is ignored.
 
     Raises:
-        DataError: the file is damaged or something is missing or of a wrong kind; names file and field.
+        DataError: the file is damaged or something is missing or of the wrong kind; names file and field.
     """
     held = read_npz(file, ("object_id", *STATES))
     arrays: dict[str, Any] = {}
@@ -55,8 +55,8 @@ class ScoreFile:
     strict: bool
 
     def __call__(self, packed: Packed) -> dict[str, Any] | Skip:
-        """``scenario_id``, what :func:`symphony.wosac.scorer.score` finds, and ``objects`` where asked for; or why
-        there is nothing.
+        """Return ``scenario_id``, the :func:`symphony.wosac.scorer.score`, and ``objects`` where asked for; or why
+        there is no score.
         """
         file, record, payload, rollouts = packed
         parsed, config = parse_scenario(payload, file, record), scorer.CHALLENGES[self.config]
@@ -96,10 +96,10 @@ def score_files(
 
     Scenarios are a WOMD scenario file, a folder of them, or a pattern; rollouts the ``.npz`` of the only scenario, or
     a folder with ``SCENARIO_ID.npz`` for each, of which with ``partial`` some may be missing. ``config`` is the year
-    of the challenge. With ``per_object`` there are the scores of each object, too; where ``strict``, a scenario that
+    of the challenge. With ``per_object`` the scores of each object are included; where ``strict``, a scenario that
     can't be scored is an error. ``progress`` is called with the scenarios done and, where known, all there are.
 
-    Gives the mean over scenarios, every scenario's own scores and what was left out, as JSON can hold it; and what
+    Returns the mean over scenarios, every scenario's own scores and what was left out, as JSON can hold it; and what
     was left out. Raises a :class:`DataError` where rollouts don't fit, or no scenario can be scored, that names file,
     scenario, agent and field.
     """
@@ -126,7 +126,7 @@ def score_files(
 
 
 def _packed(scenarios: Path, rollouts: Path, partial: bool) -> Iterator[Packed]:
-    """Every scenario to score, still packed, with the file of its rollouts."""
+    """Yield every scenario to score, still packed, with the file of its rollouts."""
     many = rollouts.is_dir()
     unused = {file.stem: file for file in rollouts.glob("*.npz")} if many else {}
     if many and not unused:

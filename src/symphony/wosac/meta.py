@@ -1,4 +1,4 @@
-"""What a submission to the challenge says about itself; imports nothing heavy, so that ``--help`` can ask for it."""
+"""The metadata of a submission to the challenge; imports nothing heavy, so that ``--help`` can ask for it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class SubmissionMeta:
-    """What a submission says about itself; there are no defaults for what only its authors can answer."""
+    """The metadata of a submission; there are no defaults for what only its authors can answer."""
 
     account_name: str  # E-mail address registered with the challenge.
     unique_method_name: str  # Short name on the leaderboard.

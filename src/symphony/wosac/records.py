@@ -1,5 +1,5 @@
-"""What the Waymo Open Sim Agents Challenge takes from a WOMD ``Scenario`` record, as logged: nothing re-centred,
-rounded or left out, and headings as they are.
+"""The parts of a WOMD ``Scenario`` record that the Waymo Open Sim Agents Challenge uses, as logged: nothing
+re-centred, rounded or left out, and headings as they are.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def read_scenarios(path: Path) -> Iterator[tuple[Path, int, bytes]]:
 
 
 def parse_scenario(payload: bytes, file: Path, record: int) -> pb.Scenario:
-    """Decode a record. Raises a :class:`DataError` where it is no scenario; names file and record."""
+    """Decode a record. Raises a :class:`DataError` where it is not a scenario; names file and record."""
     try:
         scenario = pb.Scenario.FromString(payload)
         name: str | bytes = scenario.scenario_id
@@ -59,7 +59,7 @@ def parse_scenario(payload: bytes, file: Path, record: int) -> pb.Scenario:
 
 
 def simulated_ids(scenario: pb.Scenario) -> list[int]:
-    """Ids of the objects that rollouts must hold: all that are valid at step 10, in the record's order.
+    """Return the ids of the objects that rollouts must hold: all that are valid at step 10, in the record's order.
 
     Raises a :class:`DataError` that names scenario and field.
     """
@@ -68,7 +68,7 @@ def simulated_ids(scenario: pb.Scenario) -> list[int]:
 
 
 def logged_scenario(scenario: pb.Scenario) -> WosacScenario:
-    """A record as it is scored; positions float64, world frame.
+    """Return a record as it is scored; positions float64, world frame.
 
     Raises a :class:`DataError` where it can't be scored; names scenario and field.
     """
@@ -118,7 +118,7 @@ def _check_times(scenario: pb.Scenario) -> None:
 
 
 def _check_steps(scenario: pb.Scenario, steps: int) -> None:
-    """See that the current step is the challenge's, and that agents and lights have at least so many steps."""
+    """Check that the current step is the challenge's, and that agents and lights have at least ``steps`` steps."""
 
     def error(message: str, field: str) -> DataError:
         return DataError(message, segment=scenario.scenario_id, field=field)
@@ -135,7 +135,7 @@ def _check_steps(scenario: pb.Scenario, steps: int) -> None:
 
 
 def _evaluated(scenario: pb.Scenario) -> list[int]:
-    """Ids of the recording vehicle and of the objects to predict, ascending."""
+    """Return the ids of the recording vehicle and of the objects to predict, ascending."""
     predicted = [("tracks_to_predict", one.track_index) for one in scenario.tracks_to_predict]
     chosen = set()
     for field, index in (("sdc_track_index", scenario.sdc_track_index), *predicted):

@@ -1,8 +1,8 @@
-"""Rollouts as the Waymo Open Sim Agents Challenge asks for them: 32 futures of everyone, 8 s (or less) at 10 Hz.
+"""Rollouts as the Waymo Open Sim Agents Challenge asks for them: 32 futures of all agents, 8 s (or less) at 10 Hz.
 
 Nothing of the log after the current step is used: only agents that are valid then take part, and lights keep the
 latest state seen up to then. The learned agent drives all vehicles, however few it was trained to drive. Those that
-stand stay, and people walk on; whoever drives sees the latter at constant velocity.
+stand stay, and people walk on; driven vehicles see the latter at constant velocity.
 
 Legend: A agents, n of them valid at the current step, N vehicles among these, R rollouts, F future steps (80), U
 decisions and the first state.
@@ -50,7 +50,7 @@ _STOP = (SignalState.ARROW_STOP, SignalState.STOP)
 
 
 def standing(segment: RunSegment) -> NDArray[np.bool_]:
-    """[A] vehicles that have stood for the last second and have no reason to go: no green light ahead of them.
+    """Return [A] the vehicles that have stood for the last second and have no reason to go: no green light ahead.
 
     In logs, those under a green light go within 8 s, of the others one in eight or fewer.
     """
@@ -71,16 +71,16 @@ def standing(segment: RunSegment) -> NDArray[np.bool_]:
 
 
 def _latest(segment: RunSegment) -> NDArray[np.uint8]:
-    """[Q] the latest known state of each light up to the current step."""
+    """Return [Q] the latest known state of each light up to the current step."""
     seen = segment.signal_state[:, segment.current_step :: -1]
     return seen[np.arange(len(seen)), (seen != SignalState.UNKNOWN).argmax(1)]
 
 
 def walks(segment: RunSegment, rows: NDArray[np.int64], rollouts: int, steps: int, seed: int) -> NDArray[np.float64]:
-    """[R, n, F, 3] x, y, heading of pedestrians and whoever else is driven by nobody.
+    """Return [R, n, F, 3] x, y, heading of pedestrians and all others that are not driven.
 
     They keep their velocity, each rollout with a pace and a course of its own, and their headings change as they did
-    at some step of the last second, drawn anew for each step.
+    at some step of the last second, drawn for each step.
     """
     now = segment.current_step
     stream = fold_in(torch.tensor(stream_of(segment.segment_id)), Stream.WALKS)
@@ -110,16 +110,16 @@ AT_ONCE = 1600  # observations made at a time in a search, 0.1 MB each
 
 
 def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings) -> SimulatedRollouts:
-    """32 rollouts of everyone who is valid at the segment's current step.
+    """Return 32 rollouts of all agents that are valid at the segment's current step.
 
     Between the agent's decisions positions are interpolated linearly and headings along the shorter arc; z is held.
 
-    They are in the world frame of the log, headings in [-π, π). Of the segment, with steps of 0.1 s, what lies behind
-    its current step, 10, is not looked at, but for the routes where they are the log's.
+    They are in the world frame of the log, headings in [-π, π). Of the segment, with steps of 0.1 s, nothing after
+    the current step, 10, is read, but for the routes where they are the log's.
 
     Raises a :class:`ConfigError` where the agent is log playback, or can't search as asked for, a :class:`DataError`
-    for other steps, or where nobody is valid at the current one, and a :class:`NotFiniteError` that names the segment
-    where a network of the agent puts out a number that is not finite.
+    for other steps, or where no agent is valid at the current one, and a :class:`NotFiniteError` that names the
+    segment where a network of the agent returns a number that is not finite.
     """
     if agent.policy is None:
         raise ConfigError("log playback knows the future and can't be simulated")
@@ -142,7 +142,7 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings) -
 
 
 def constant_velocity(segment: RunSegment, future: int = FUTURE) -> SimulatedRollouts:
-    """32 equal rollouts of everyone at the velocity and heading of the current step.
+    """Return 32 equal rollouts of all agents at the velocity and heading of the current step.
 
     Raises a :class:`DataError` as :func:`wosac_rollouts` does.
     """
@@ -153,7 +153,7 @@ def constant_velocity(segment: RunSegment, future: int = FUTURE) -> SimulatedRol
 def simulated_scenarios(
     agent: Agent, data: Path, settings: WosacSettings, progress: Callable[[int], None] = lambda done: None
 ) -> Iterator[tuple[str, SimulatedRollouts]]:
-    """Yield id and rollouts of every WOMD scenario of a file, folder or pattern; everyone's, odd ones included.
+    """Yield id and rollouts of every WOMD scenario of a file, folder or pattern, of all agents, odd ones included.
 
     Raises a :class:`DataError` where a record can't be used; names file, scenario and field.
     """
@@ -167,7 +167,7 @@ def simulated_scenarios(
 def _simulated(
     agent: Agent, settings: WosacSettings, packed: tuple[Path, int, bytes]
 ) -> tuple[str, SimulatedRollouts]:
-    """The id and the rollouts of a packed scenario."""
+    """Return the id and the rollouts of a packed scenario."""
     file, record, payload = packed
     scenario = parse_scenario(payload, file, record)
     try:
@@ -179,8 +179,8 @@ def _simulated(
 
 
 def with_the_rest(found: SimulatedRollouts, segment: RunSegment) -> SimulatedRollouts:
-    """Rollouts of everyone in a segment, as a submission must hold them: agents that were left out as odd go on at
-    their velocity. Raises a :class:`DataError` where a state of theirs at the current step is not finite.
+    """Return rollouts of all agents in a segment, as a submission must hold them: agents that were left out as odd go
+    on at their velocity. Raises a :class:`DataError` where a state of theirs at the current step is not finite.
     """
     now = segment.current_step
     rest = np.asarray(segment.valid[:, now] & ~np.isin(segment.agent_id, found.object_id))
@@ -195,8 +195,8 @@ def with_the_rest(found: SimulatedRollouts, segment: RunSegment) -> SimulatedRol
 
 
 def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSegment:
-    """What a simulator may know, as a segment to drive in, with steps of ``dt`` seconds: it begins with the current
-    step, all agents that are valid then go on at constant velocity, and lights keep their latest state.
+    """Return what a simulator may know, as a segment to drive in, with steps of ``dt`` seconds: it begins with the
+    current step, all agents that are valid then go on at constant velocity, and lights keep their latest state.
     """
     rows, now = _present(segment), segment.current_step
     steps = math.ceil(future * DT / dt - 1e-6) + 1
@@ -216,21 +216,21 @@ def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSeg
 
 
 def future_log(segment: RunSegment) -> RunSegment:
-    """What became of those who are valid at the current step, from it on, in the rows of :func:`history_only`."""
+    """Return the log from the current step on of agents valid then, in the rows of :func:`history_only`."""
     rows, now = _present(segment), segment.current_step
     states = {name: getattr(segment, name)[rows, now:] for name in _TIMED}
     return _from_now_on(segment, rows, signal_state=segment.signal_state[:, now:], **states)
 
 
 def _from_now_on(segment: RunSegment, rows: NDArray[np.int64], **changes: Any) -> RunSegment:
-    """Some agents of a segment; its ego, which is not always among them, and what it marks decide nothing here."""
+    """Return some agents of a segment; its ego, not always one of them, and its marks decide nothing here."""
     kept = {name: getattr(segment, name)[rows] for name in ("agent_id", "agent_type", "size")}
     none = np.zeros(0, np.int32)
     return segment.replace(ego=0, current_step=0, interest=none, predict=none, **kept, **changes)
 
 
 def between_decisions(states: Doubles, dt: float, future: int = FUTURE) -> Doubles:
-    """[R, N, F, 3] x, y, heading at 10 Hz from states [R, U, N, 3] every ``dt`` s, the first at the current step."""
+    """Return [R, N, F, 3] x, y, heading at 10 Hz from states [R, U, N, 3] every ``dt`` s, the first at present."""
     where = np.arange(1, future + 1) * DT / dt
     before = np.floor(where + 1e-6).astype(np.int64)
     share = np.where(where - before < 1e-6, 0.0, where - before)[:, None]
@@ -242,7 +242,7 @@ def between_decisions(states: Doubles, dt: float, future: int = FUTURE) -> Doubl
 
 
 def _present(segment: RunSegment) -> NDArray[np.int64]:
-    """[n] rows of the agents that are valid at the current step."""
+    """Return [n] rows of the agents that are valid at the current step."""
     rows = np.flatnonzero(segment.valid[:, CURRENT])
     for wrong, message, field in (
         (abs(segment.dt - DT) > 1e-6, f"has steps of {segment.dt:g} s, needs {DT:g}", "dt"),
@@ -255,7 +255,7 @@ def _present(segment: RunSegment) -> NDArray[np.int64]:
 
 
 def _extrapolated(segment: RunSegment, rows: NDArray[np.int64], future: int) -> Doubles:
-    """[R, n, F, 3] x, y, heading at constant velocity."""
+    """Return [R, n, F, 3] x, y, heading at constant velocity."""
     now = segment.current_step
     place = segment.position[rows, now, None, :2].astype(np.float64)
     path = place + segment.velocity[rows, now, None] * (np.arange(1, future + 1) * DT)[:, None]
@@ -270,7 +270,7 @@ def _driven(
     settings: WosacSettings,
     log: RunSegment | None,
 ) -> Doubles:
-    """[R, U, N, 3] x, y, heading of the vehicles; on the routes of the log, where there is one."""
+    """Return [R, U, N, 3] x, y, heading of the vehicles; on the routes of the log, where there is one."""
     graph = LaneGraph(start.road) if agent.routed else None
     scenes = scene(start, vehicles.tolist(), graph)
     if graph is not None and log is not None:
@@ -295,7 +295,7 @@ def _driven(
 
 
 def _rollouts(segment: RunSegment, rows: NDArray[np.int64], states: Doubles) -> SimulatedRollouts:
-    """States [32, n, F, 3] of the segment's frame in that of the log."""
+    """Return states [32, n, F, 3] of the segment's frame in that of the log."""
     z = segment.position[rows, segment.current_step, 2].astype(np.float64) + segment.origin[2]
     return SimulatedRollouts(
         object_id=segment.agent_id[rows],

@@ -62,12 +62,12 @@ class _Member(tarfile.TarInfo):
 
 
 def meta_message(meta: SubmissionMeta) -> pb.SimAgentsChallengeSubmission:
-    """A submission without scenarios."""
+    """Return a submission without scenarios."""
     return pb.SimAgentsChallengeSubmission(submission_type=SIM_AGENTS, **vars(meta))
 
 
 def meta_problems(message: pb.SimAgentsChallengeSubmission) -> Iterator[tuple[str, str]]:
-    """(field, what is wrong with it) of a submission's metadata."""
+    """Yield (field, what is wrong with it) of a submission's metadata."""
     if message.submission_type != SIM_AGENTS:
         yield "submission_type", f"is {message.submission_type}, expected {SIM_AGENTS} (sim agents)"
     if "@" not in message.account_name:
@@ -87,7 +87,7 @@ def meta_problems(message: pb.SimAgentsChallengeSubmission) -> Iterator[tuple[st
 
 
 def shard_name(shard: int, shards: int) -> str:
-    """File name of a shard; the server finds shards by it."""
+    """Return the file name of a shard, by which the server finds it."""
     return f"submission.binproto-{shard:05d}-of-{shards:05d}"
 
 
@@ -96,9 +96,9 @@ def write_submission(
 ) -> int:
     """Write an archive; one scenario at a time is in memory, and ``out`` appears once all are written.
 
-    Scenarios are dealt out to so many ``shards``, files in the archive, in turn. Gives how many were written. Raises
-    a :class:`ConfigError` where ``meta``, ``out`` (a ``.tar.gz``) or ``shards`` can't be used, and a
-    :class:`DataError` that names scenario, field and agent for rollouts that the server would refuse.
+    Scenarios are dealt out in turn to ``shards`` files in the archive. Returns how many were written. Raises a
+    :class:`ConfigError` where ``meta``, ``out`` (a ``.tar.gz``) or ``shards`` can't be used, and a :class:`DataError`
+    that names scenario, field and agent for rollouts that the server would refuse.
     """
     if shards < 1:
         raise ConfigError(f"shards must be at least 1, is {shards}")
@@ -131,7 +131,7 @@ def write_submission(
 
 
 def _pack(files: list[Path], out: Path) -> None:
-    """Nothing of the machine or the hour goes in, so that the same shards make the same archive."""
+    """Pack files into an archive without the machine or the hour, so that equal shards make equal archives."""
     with (
         out.open("wb") as raw,
         gzip.GzipFile("", "wb", compresslevel=6, fileobj=raw, mtime=0) as zipped,
@@ -145,7 +145,7 @@ def _pack(files: list[Path], out: Path) -> None:
 
 
 def scenario_message(scenario_id: str, rollouts: SimulatedRollouts) -> pb.ScenarioRollouts:
-    """The message of a scenario's rollouts.
+    """Return the message of a scenario's rollouts.
 
     Raises a :class:`DataError` for other than 32 rollouts of 80 steps of finite numbers, an agent twice, or an id
     that the format has no room for; names scenario, field and agent.
@@ -168,8 +168,8 @@ def scenario_message(scenario_id: str, rollouts: SimulatedRollouts) -> pb.Scenar
 
 @dataclass
 class Report:
-    """What was found in a submission: what a server would refuse, naming shard, scenario, agent and field, the first
-    of each scenario; the names of its shards and the ids of its scenarios.
+    """The findings in a submission: what a server would refuse, naming shard, scenario, agent and field, the first of
+    each scenario; the names of its shards and the ids of its scenarios.
     """
 
     problems: list[DataError] = default(default_factory=list)
@@ -178,9 +178,9 @@ class Report:
 
 
 def required_agents(path: Path) -> dict[str, list[int]]:
-    """The agents that each scenario's rollouts must hold, by scenario id, from WOMD scenario files (see
-    :func:`symphony.wosac.records.read_scenarios`); those of the test set will do. Raises a :class:`DataError` where a
-    file or record can't be used; names it.
+    """Return the agents that each scenario's rollouts must hold, by scenario id, from WOMD scenario files (see
+    :func:`symphony.wosac.records.read_scenarios`); those of the test set are enough. Raises a :class:`DataError`
+    where a file or record can't be used; names it.
     """
     found: dict[str, list[int]] = {}
     for file, record, payload in read_scenarios(path):
@@ -197,8 +197,8 @@ def required_agents(path: Path) -> dict[str, list[int]]:
 def check_submission(path: Path, required: Mapping[str, list[int]] | None = None) -> Report:
     """Read a submission from end to end, one scenario at a time.
 
-    Without the ``required`` agents by scenario (see :func:`required_agents`), that scenarios and agents are the right
-    ones is not checked; only that all rollouts of a scenario have the same agents.
+    Without the ``required`` agents by scenario (see :func:`required_agents`), only the agents of a scenario's
+    rollouts are compared with each other, not with those wanted.
     """
     report, metas = Report(), set[bytes]()
     try:
@@ -224,7 +224,7 @@ def check_submission(path: Path, required: Mapping[str, list[int]] | None = None
 def _check_shard(
     stream: IO[bytes], name: str, where: str, report: Report, required: Mapping[str, list[int]] | None
 ) -> bytes:
-    """Note what is wrong with a shard; its metadata as bytes, none where it is damaged."""
+    """Note the problems of a shard; return its metadata as bytes, none where it is damaged."""
     problems = report.problems
     if not _SHARD.fullmatch(name):
         wanted = "NAME.binproto-NNNNN-of-NNNNN, by which the server finds shards"
@@ -251,7 +251,7 @@ def _check_shard(
 
 
 def _messages(stream: IO[bytes]) -> Iterator[pb.SimAgentsChallengeSubmission]:
-    """A shard in parts: its scenarios one by one, as long as they come first, then the rest, with the metadata."""
+    """Yield a shard in parts: its scenarios one by one, while they come first, then the rest with the metadata."""
     while (tag := stream.read(1)) == _SCENARIO_TAG:
         head = b""  # the length: seven bits in each byte, the last of which is below 0x80
         while len(head) < 5 and (byte := stream.read(1)):
@@ -269,7 +269,7 @@ def _messages(stream: IO[bytes]) -> Iterator[pb.SimAgentsChallengeSubmission]:
 
 
 def _names_problem(names: list[str]) -> list[str]:
-    """What is wrong with the names of the shards, counted from 0, as the organisers' example does, or from 1."""
+    """Return the problems of the names of the shards, counted from 0, as the organisers' example does, or from 1."""
     numbers = [tuple(map(int, match.groups())) for name in names if (match := _SHARD.fullmatch(name))]
     totals = {total for _, total in numbers}
     if len(totals) != 1:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 
 class Column(NamedTuple):
-    """A number as it is shown: times ``scale``, with ``digits`` after the point."""
+    """A number as shown: times ``scale``, with ``digits`` after the point."""
 
     key: str
     title: str
@@ -33,7 +33,7 @@ _WORDS = {
 
 
 def wosac_table(record: dict[str, Any]) -> str:
-    """A table in Markdown: the baselines of a record that has them, its agent, and what the table is of."""
+    """Return a table in Markdown: the baselines of a record that has them, its agent, and what the table is of."""
     name, found = record["agent"], record["agents"]
     rows = [(_WORDS[other], numbers) for other, numbers in found.items() if other in _WORDS and len(found) > 1]
     rows.append((f"{name}, {how_in_words(record['how'])}", found[name]))
@@ -47,7 +47,7 @@ def wosac_table(record: dict[str, Any]) -> str:
 
 
 def how_in_words(how: dict[str, Any]) -> str:
-    """How rollouts came about, such as ``32 trees of 4, systematic every 2, sampled goals``."""
+    """Return how rollouts were made, such as ``32 trees of 4, systematic every 2, sampled goals``."""
     way = {
         "tree": "32 trees of {branches}, {rule} every {prune_every}",
         "backtrack": "back where bad, every {prune_every}",

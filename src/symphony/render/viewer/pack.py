@@ -1,6 +1,6 @@
-"""What a page holds of each run segment: arrays of small integers, deflated, in base64.
+"""The data of a page for each run segment: arrays of small integers, deflated, in base64.
 
-The log of a segment is a block, and so is what each planner made of it: the deflated (zlib) form of the length of a
+The log of a segment is a block, and so are the rollouts of each planner: the deflated (zlib) form of the length of a
 header (4 bytes, little-endian), the header as JSON, the arrays one after the other. The header has ``facts`` and
 ``arrays``; of each array its ``name``, ``type``, ``shape``, ``offset`` behind the header, the ``scale`` its integers
 are multiplied with, and whether they are differences along the last axis (``delta``).
@@ -33,11 +33,11 @@ SCRIPTS = ("data.js", "map.js", "scene.js", "search.js", "panels.js", "main.js")
 
 
 def view_page(names: Sequence[str], found: Iterable[Sequence[Replay | None]]) -> str:
-    """One self-contained page that plays rollouts: canvas and plain JavaScript, nothing is loaded from elsewhere.
+    """Return a self-contained page that plays rollouts: canvas and plain JavaScript, nothing is loaded from the net.
 
     ``#segment=ID&rollout=K&t=SECONDS&agent=ID`` behind its address names what it shows.
 
-    Takes the names of those who are shown side by side, and for each segment what each of them made of it, None for
+    Takes the names of those that are shown side by side, and for each segment the replay of each of them, None for
     nothing. Raises a :class:`DataError` where they were simulated on different logs or steps, or a number is too
     large for the page.
     """
@@ -69,7 +69,7 @@ def view_page(names: Sequence[str], found: Iterable[Sequence[Replay | None]]) ->
 
 
 def _kinds(replay: Replay) -> list[list[str]]:
-    """The kinds of events of each rollout, to choose rollouts by."""
+    """Return the kinds of events of each rollout, to choose rollouts by."""
     found = [{"failed"} if k in replay.saved.failed else set[str]() for k in range(replay.saved.rollouts)]
     for event in replay.events:
         found[event.rollout] |= {event.kind} | ({"fault"} if event.fault else set())
@@ -77,17 +77,17 @@ def _kinds(replay: Replay) -> list[list[str]]:
 
 
 def template(name: str) -> str:
-    """A file that lies beside this one."""
+    """Return a file that lies beside this one."""
     return (files(__package__) / name).read_text(encoding="utf-8")
 
 
 def script_json(value: Any) -> str:
-    """JSON that can stand within a script element; numbers that are not finite become null."""
+    """Return JSON that can stand within a script element; numbers that are not finite become null."""
     return json.dumps(finite(value), ensure_ascii=False, allow_nan=False, default=str).replace("<", "\\u003c")
 
 
 def filled(page: str, parts: Mapping[str, str]) -> str:
-    """A page with its markers replaced, each once; what replaces them is not looked at again."""
+    """Return a page with its markers replaced, each once; the replacements are not searched for markers."""
     for marker in parts:
         before, found, after = page.partition(marker)
         if not found:
@@ -105,7 +105,7 @@ FAR = 10.2  # seconds to a collision above which the page knows none
 
 @dataclass(frozen=True)
 class Event:
-    """Something to be marked in a replay."""
+    """An event to mark in a replay."""
 
     rollout: int  # its number
     step: int  # the state at which it happens, from 0
@@ -118,7 +118,7 @@ class Event:
 
 
 class Replay(NamedTuple):
-    """What is shown of a run segment."""
+    """The rollouts of a run segment as a page shows them."""
 
     saved: SavedRollouts
     events: Sequence[Event] = ()
@@ -155,7 +155,7 @@ class _Packer:
             self.add(f"{name}.{letter}", "i32", lines.points[:, axis], MILLIMETRE, delta=True)
 
     def states(self, name: str, state: NDArray[Any]) -> None:
-        """States [..., T, 4], zero where there are none."""
+        """Add states [..., T, 4], zero where there are none."""
         heading = np.remainder(state[..., 2].astype(np.float64) + math.pi, 2 * math.pi) - math.pi
         for axis, letter in enumerate("xy"):
             self.add(f"{name}.{letter}", "i32", state[..., axis], MILLIMETRE, delta=True)
@@ -171,7 +171,7 @@ class _Packer:
 
 
 def packed(replay: Replay) -> str:
-    """What was simulated of a run segment; a DataError names an array with a number too large for the page."""
+    """Return the simulated rollouts of a run segment; a DataError names an array with too large a number."""
     saved, packer = replay.saved, _Packer()
     facts: dict[str, Any] = {
         "rollouts": saved.rollouts,
@@ -200,7 +200,7 @@ def packed(replay: Replay) -> str:
 
 
 def packed_log(saved: SavedRollouts) -> str:
-    """What was logged of a run segment while it was simulated, its map and its lights; see :func:`packed`."""
+    """Return the log of a run segment while it was simulated, its map and its lights; see :func:`packed`."""
     segment, packer, within = saved.segment, _Packer(), slice(saved.start, saved.last + 1)
     facts: dict[str, Any] = {
         "id": segment.segment_id,

@@ -1,4 +1,4 @@
-"""Boxes in the plane: the distance to the nearest one, and the time to collision with the one that is followed."""
+"""Boxes in the plane: the distance to the nearest one, and the time to collision with the one ahead."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Boxes(NamedTuple):
     speed: Float[Tensor, "R n T"]  # m/s in the plane, NaN where unknown
 
     def blocks(self, evaluated: int) -> Iterator[Boxes]:
-        """A few rollouts at a time, as many as memory is meant for."""
+        """Yield a few rollouts at a time, as memory allows."""
         step = max(1, _PAIRS // max(1, evaluated * self.valid[0].numel()))
         for start in range(0, len(self.valid), step):
             yield Boxes(*(values[start : start + step] for values in self))
@@ -41,7 +41,7 @@ class Boxes(NamedTuple):
 def corners(
     center: Float[Tensor, "*batch 2"], heading: Float[Tensor, "*batch"], size: Float[Tensor, "*batch 2"]
 ) -> Float[Tensor, "*batch 4 2"]:
-    """Corners counter-clockwise: front left, rear left, rear right, front right.
+    """Return corners counter-clockwise: front left, rear left, rear right, front right.
 
     In float32, which rounds them to millimetres far from the origin: unlike :func:`symphony.geometry.box_corners`,
     sine and cosine are correctly rounded, so that this rounding is always the official scorer's.
@@ -53,7 +53,7 @@ def corners(
 
 
 def rectangle_gap(a: Float[Tensor, "M 4 2"], b: Float[Tensor, "M 4 2"]) -> Float[Tensor, " M"]:
-    """Signed distance of rectangles, given by their corners counter-clockwise.
+    """Return the signed distance of rectangles, given by their corners counter-clockwise.
 
     The Euclidean gap, or minus the length of the shortest translation that separates them: the distance of the origin
     to the edge of the octagon of all differences of a point of a and one of b, negative inside.
@@ -83,7 +83,7 @@ def _from_the_lowest(corners: Tensor) -> Tensor:
 
 
 def distance_to_nearest(boxes: Boxes, evaluated: int) -> Float[Tensor, "R E T"]:
-    """Signed distance in the plane from each of the first E objects to the nearest other one.
+    """Return the signed distance in the plane from each of the first E objects to the nearest other one.
 
     Boxes have rounded corners: a core, smaller by ``2 r`` in length and width, grown by ``r``, where ``r`` is
     :data:`ROUNDING` times half the shorter side. Negative is minus the depth of the overlap of the cores, less both
@@ -119,10 +119,10 @@ def _nearest(boxes: Boxes, evaluated: int) -> Tensor:
 
 
 def time_to_collision(boxes: Boxes, evaluated: int) -> Float[Tensor, "R E T"]:
-    """Seconds until each of the first E objects would hit the one it follows if both kept their speeds, at most 5.
+    """Return seconds until each of the first E objects would hit the one it follows at their speeds, at most 5.
 
     The difference of the headings is taken as it is, not brought into one turn, as the official scorer does: a pair
-    whose headings are a turn apart has no follower. Whether the object itself is valid is not looked at.
+    whose headings are a turn apart has no follower. The validity of the object itself is ignored.
     """
     return torch.cat([_time_to_collision(block, evaluated) for block in boxes.blocks(evaluated)])
 

@@ -1,4 +1,4 @@
-"""How features become a score: the components of the challenges of 2024 and 2025, their weights and their bins."""
+"""The components of the score in the challenges of 2024 and 2025: their features, weights and bins."""
 
 from __future__ import annotations
 

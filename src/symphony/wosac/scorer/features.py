@@ -1,4 +1,4 @@
-"""What is compared between log and rollouts: one number or flag per scored object and step."""
+"""The features compared between log and rollouts: one number or flag per scored object and step."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class WosacFeatures:
 
 
 def compute_features(scenario: WosacScenario, rollouts: SimulatedRollouts) -> WosacFeatures:
-    """Features of log and rollouts.
+    """Return the features of log and rollouts.
 
     Raises a :class:`DataError` where the two don't fit together; names scenario, field and agent.
     """
@@ -62,7 +62,7 @@ def compute_features(scenario: WosacScenario, rollouts: SimulatedRollouts) -> Wo
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Many small steps: several threads would wait for each other most of the time, and burn it."""
+    """Run many small steps on one thread: several would mostly wait for each other, and burn time."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -112,7 +112,7 @@ def _tracks(scenario: WosacScenario, rollouts: SimulatedRollouts) -> _Tracks:
 
 
 def _features(tracks: _Tracks, scenario: WosacScenario) -> dict[str, Tensor]:
-    """Features of the log, in row 0, and of all rollouts, [R, E, 80]."""
+    """Return the features of the log, in row 0, and of all rollouts, [R, E, 80]."""
     count, valid = tracks.evaluated, tracks.valid
     future, scored = slice(CURRENT + 1, None), (slice(None), slice(tracks.evaluated))
     x, y, z, heading = (values[scored] for values in (tracks.x, tracks.y, tracks.z, tracks.heading))
@@ -154,19 +154,19 @@ def _features(tracks: _Tracks, scenario: WosacScenario) -> dict[str, Tensor]:
 
 
 def central_difference(values: Float[Tensor, "*batch T"]) -> Float[Tensor, "*batch T"]:
-    """Half the difference between the next step and the one before; NaN at both ends."""
+    """Return half the difference between the next step and the one before; NaN at both ends."""
     result = torch.full_like(values, math.nan)
     result[..., 1:-1] = (values[..., 2:] - values[..., :-2]) / 2
     return result
 
 
 def wrap(angle: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """The same direction in [-pi, pi)."""
+    """Wrap an angle to the same direction in [-pi, pi)."""
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
 def speed(*coordinates: Float[Tensor, "*batch T"]) -> Float[Tensor, "*batch T"]:
-    """m/s along any number of axes in metres."""
+    """Return m/s along any number of axes in metres."""
     squared = torch.zeros_like(coordinates[0])
     for axis in coordinates:
         squared = squared + central_difference(axis).square()
@@ -177,6 +177,6 @@ def speed(*coordinates: Float[Tensor, "*batch T"]) -> Float[Tensor, "*batch T"]:
 def angular(
     heading: Float[Tensor, "*batch T"],
 ) -> tuple[Float[Tensor, "*batch T"], Float[Tensor, "*batch T"]]:
-    """(rad/s, rad/s²); each difference over two steps is taken the short way round."""
+    """Return (rad/s, rad/s²); each difference over two steps is taken the short way round."""
     turn = wrap(central_difference(heading) * 2) / 2
     return turn / DT, wrap(central_difference(turn) * 2) / 2 / (DT * DT)

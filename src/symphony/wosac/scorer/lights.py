@@ -55,20 +55,20 @@ class Lanes:
         return shapely.STRtree(shapely.points(self.start.double().numpy()))
 
     def share(self, points: Float[Tensor, "*#shape 2"]) -> Float[Tensor, "*#shape"]:
-        """Where along the line through each segment a point is: 0 at the first point, 1 at the last."""
+        """Return where along the line through each segment a point is: 0 at its first point, 1 at its last."""
         away = points - self.start
         dot = away[..., 0] * self.along[..., 0] + away[..., 1] * self.along[..., 1]
         return torch.where(self.squared == 0, 0.0, dot / torch.where(self.squared == 0, 1.0, self.squared))
 
     def compared(self, points: Float[Tensor, "M 2"]) -> Float[Tensor, " M"]:
-        """What the official scorer takes for the distance of a point to each of M segments: ``|away + t along|``,
-        where the distance would be ``|away - t along|``.
+        """Return the official scorer's distance of a point to each of M segments: ``|away + t along|``, where the
+        true distance is ``|away - t along|``.
         """
         x, y = (points - self.start + self.share(points).clamp(0, 1)[:, None] * self.along).unbind(-1)
         return (x * x + y * y).sqrt()
 
     def nearest(self, points: Float[Tensor, "M 2"]) -> Int[Tensor, " M"]:
-        """Index of the segment that the official scorer takes for the nearest; there must be one."""
+        """Return the index of the segment that the official scorer takes for the nearest; there must be one."""
         # What is compared is never less than the distance to the first point of a segment.
         places = shapely.points(points.double().numpy())
         bound = self[torch.from_numpy(self._starts.nearest(places))].compared(points).double()
@@ -101,7 +101,7 @@ class Signals:
 def red_light_violations(
     position: Float[Tensor, "*batch T 2"], valid: Bool[Tensor, "*batch T"], lanes: Lanes, signals: Signals
 ) -> Bool[Tensor, "*batch T"]:
-    """At which steps a box's centre passes the stop point of a red signal while its lane is the signal's.
+    """Return at which steps a box's centre passes the stop point of a red signal while its lane is the signal's.
 
     The lane of a box is that of its nearest segment (see :meth:`Lanes.nearest`) at the step. Passing means to be
     before the stop point, along the signal lane's segment nearest to it, at the step before, and beyond it at the

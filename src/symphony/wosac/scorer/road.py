@@ -62,8 +62,8 @@ class Edges:
     def offset(
         self, points: Float[Tensor, "M 3"], segment: Int[Tensor, " M"]
     ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, " M"]]:
-        """From the nearest place of a segment, in the plane, to each point; and where along the segment's line the
-        point is, 0 at the first point and 1 at the last.
+        """Return the vector from the nearest place of a segment, in the plane, to each point; and where along the
+        segment's line the point is, 0 at the first point and 1 at the last.
         """
         away, along, squared = points - self.start[segment], self.along[segment], self.squared[segment]
         share = away[:, 0] * along[:, 0] + away[:, 1] * along[:, 1]
@@ -73,13 +73,13 @@ class Edges:
     def distance(
         self, points: Float[Tensor, "M 3"], segment: Int[Tensor, " M"], stretch: float
     ) -> Float[Tensor, " M"]:
-        """Distance that decides which segment is nearest, with heights multiplied by ``stretch``."""
+        """Return the distance that decides which segment is nearest, with heights multiplied by ``stretch``."""
         x, y, z = self.offset(points, segment)[0].unbind(-1)
         z = z * stretch
         return (x * x + y * y + z * z).sqrt()
 
     def nearest(self, points: Float[Tensor, "M 3"], stretch: float) -> Int[Tensor, " M"]:
-        """Index of the nearest segment to each point; of several, the first one.
+        """Return the index of the nearest segment to each point; of several, the first one.
 
         Points share a cell. The segment that is nearest to one of them in the plane gives a bound for all of them;
         only segments within it, and within the cell's size more, are measured for each point.
@@ -103,14 +103,14 @@ class Edges:
         return first_of_least(row, segment, self.distance(points[row], segment, stretch), len(points))
 
     def side(self, points: Float[Tensor, "M 3"], segment: Int[Tensor, " M"]) -> Float[Tensor, " M"]:
-        """1 to the right of the line through the segment, -1 to its left, 0 on it."""
+        """Return 1 to the right of the line through the segment, -1 to its left, 0 on it."""
         return cross(points - self.start[segment], self.along[segment]).sign()
 
 
 def first_of_least(
     row: Int[Tensor, " Q"], segment: Int[Tensor, " Q"], distance: Float[Tensor, " Q"], count: int
 ) -> Int[Tensor, " M"]:
-    """The segment at the smallest distance in each of M rows, the first of several."""
+    """Return the segment at the smallest distance in each of M rows, the first of several."""
     least = torch.full((count,), torch.inf).scatter_reduce_(0, row, distance, "amin")
     tied = distance == least[row]
     found = torch.full((count,), torch.iinfo(torch.int64).max)
@@ -118,14 +118,14 @@ def first_of_least(
 
 
 def cross(a: Float[Tensor, "*shape 3"], b: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape"]:
-    """Cross product in the plane."""
+    """Return the cross product in the plane."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def signed_distance_to_edges(
     points: Float[Tensor, "M 3"], edges: Edges, stretch: float = STRETCH
 ) -> Float[Tensor, " M"]:
-    """Distance in the plane to the nearest edge, positive to its right (off the road), negative to its left.
+    """Return the plane distance to the nearest edge: positive to its right (off the road), negative to its left.
 
     The nearest is chosen with heights multiplied by ``stretch``. Where the nearest place is an end that two segments
     share, the side is that of both: right of either where the line turns left, of both where it turns right.
@@ -156,7 +156,7 @@ def distance_to_road_edge(
     valid: Bool[Tensor, "*batch"],
     edges: Edges,
 ) -> Float[Tensor, "*batch"]:
-    """Greatest signed distance of a box's four lower corners; :data:`NOWHERE` where it is not valid."""
+    """Return the greatest signed distance of a box's four lower corners; :data:`NOWHERE` where it is not valid."""
     ground = corners(center[..., :2], heading, size[..., :2])
     bottom = center[..., 2] - size[..., 2] / 2
     points = torch.cat([ground, bottom[..., None, None].expand(*ground.shape[:-1], 1)], dim=-1)

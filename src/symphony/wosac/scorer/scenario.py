@@ -1,4 +1,4 @@
-"""What is scored: a logged scenario and rollouts of it, as plain arrays."""
+"""The input of the score: a logged scenario and rollouts of it, as plain arrays."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class WosacScenario:
 
     @property
     def sim_agents(self) -> Ints:
-        """[n] ids of the objects that a rollout must hold: all that are valid at step 10."""
+        """The ids [n] of the objects that a rollout must hold: all that are valid at step 10."""
         return self.object_id[self.valid[:, CURRENT]]
 
 
@@ -92,7 +92,7 @@ class SimulatedRollouts:
     heading: Reals  # [R, n, 80] radians
 
     def check(self, agents: Ints | None = None, future: int = FUTURE, count: int | None = None) -> None:
-        """See that all is there and finite, and as many agents, steps and rollouts as there must be.
+        """Check that all is present and finite, with the right number of agents, steps and rollouts.
 
         Raises a :class:`DataError` that names field and agent.
         """
@@ -115,9 +115,9 @@ class SimulatedRollouts:
 
 
 def check_agents(found: Ints, wanted: Ints) -> None:
-    """See that rollouts hold just the wanted agents.
+    """Check that rollouts hold exactly the wanted agents.
 
-    Raises a :class:`DataError` where an agent is missing, there more than once, or not one of those to simulate.
+    Raises a :class:`DataError` where an agent is missing, present more than once, or not one of those to simulate.
     """
     ids, counts = np.unique(found, return_counts=True)
     for who, problem in (
@@ -130,7 +130,7 @@ def check_agents(found: Ints, wanted: Ints) -> None:
 
 
 def _finite(values: Any) -> NDArray[np.bool_]:
-    """Whether numbers are finite in float32, in which all is scored."""
+    """Return whether numbers are finite in float32, in which all is scored."""
     return np.asarray(np.abs(values) <= np.finfo(np.float32).max)
 
 

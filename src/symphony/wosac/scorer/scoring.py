@@ -36,8 +36,8 @@ def score(
 ) -> dict[str, float]:
     """Score the rollouts of a scenario.
 
-    Gives ``metametric``, the score of the challenge: the weighted sum of the likelihoods; each component's likelihood
-    (``NAME_likelihood``, 0 to 1); the weighted means of the groups of components (``kinematic_metrics``,
+    Returns ``metametric``, the score of the challenge: the weighted sum of the likelihoods; each component's
+    likelihood (``NAME_likelihood``, 0 to 1); the weighted means of the groups of components (``kinematic_metrics``,
     ``interactive_metrics``, ``map_based_metrics``); metres from the log with the history, as the mean over rollouts
     and objects (``average_displacement_error``) and of the best rollout (``min_ade``); shares of rollouts and objects
     that collide, leave the road or run a red light at a step at which the log is valid (``simulated_collision_rate``
@@ -53,7 +53,7 @@ def score(
 
 
 def score_features(features: WosacFeatures, config: WosacConfig = CHALLENGES["2025"]) -> dict[str, float]:
-    """What :func:`score` returns, from features that were computed before.
+    """Return the same as :func:`score`, from features that were computed before.
 
     Raises a :class:`DataError` where at no step the log says anything about a component; names it.
     """
@@ -78,13 +78,13 @@ def score_features(features: WosacFeatures, config: WosacConfig = CHALLENGES["20
 
 
 def mean_scores(scores: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """The mean over scenarios of every number; needs at least one."""
+    """Return the mean over scenarios of every number; needs at least one."""
     every = list(scores)
     return {name: math.fsum(one[name] for one in every) / len(every) for name in every[0]}
 
 
 def check_scored(scenario: WosacScenario, config: WosacConfig = CHALLENGES["2025"]) -> None:
-    """See that the log of a scenario says something about every component, before anything is simulated.
+    """Check that the log of a scenario says something about every component, before anything is simulated.
 
     Raises:
         DataError: it doesn't, such as one without vehicles or a future; names scenario and component.
@@ -104,9 +104,9 @@ def _check(mask: Tensor, name: str) -> None:
 
 
 def object_scores(features: WosacFeatures, config: WosacConfig = CHALLENGES["2025"]) -> list[dict[str, Any]]:
-    """What each scored object adds: the likelihoods of its own log, its errors and the shares of its rollouts.
+    """Return the part of each scored object: the likelihoods of its own log, its errors, the shares of its rollouts.
 
-    The score of the scenario is no mean of these: a scenario's likelihoods take all objects' steps together. NaN
+    The score of the scenario is not the mean of these: a scenario's likelihoods take all objects' steps together. NaN
     where the object has no step to score.
     """
     parts: dict[str, list[Any]] = {
@@ -126,7 +126,7 @@ def object_scores(features: WosacFeatures, config: WosacConfig = CHALLENGES["202
 
 
 def log_likelihoods(features: WosacFeatures, config: WosacConfig) -> dict[str, Tensor]:
-    """ln of the likelihood of what was logged, for every component: [E, 80], or [E] of yes or no; not masked."""
+    """Return ln of the likelihood of the log for every component: [E, 80], or [E] of yes or no; not masked."""
     found = {}
     for name, component in config.items():
         if component.bins is None:
@@ -141,7 +141,7 @@ def log_likelihoods(features: WosacFeatures, config: WosacConfig) -> dict[str, T
 def histogram_log_likelihood(
     log: Float[Tensor, "E T"], simulated: Float[Tensor, "R E T"], bins: tuple[float, float, int]
 ) -> Float[Tensor, "E T"]:
-    """ln of the share of an object's simulated values, smoothed, in the bin of the logged value.
+    """Return ln of the share of an object's simulated values, smoothed, in the bin of the logged value.
 
     Every simulated value counts, also at steps at which the log is not valid.
     """
@@ -154,14 +154,14 @@ def histogram_log_likelihood(
 
 
 def bin_of(values: Float[Tensor, "*shape"], bins: tuple[float, float, int]) -> Int[Tensor, "*shape"]:
-    """Index of each value's bin: outside counts as the nearest bin, not a number as the last one."""
+    """Return the index of each value's bin: outside counts as the nearest bin, NaN as the last one."""
     inner = bin_edges(bins)[1:-1].contiguous()
     index = torch.bucketize(values.contiguous(), inner, right=True)
     return torch.where(values.isnan(), bins[2] - 1, index)
 
 
 def bin_edges(bins: tuple[float, float, int]) -> Float[Tensor, " K"]:
-    """The bins' edges in float32, as the official scorer rounds them."""
+    """Return the bins' edges in float32, as the official scorer rounds them."""
     low, high = torch.tensor(bins[:2], dtype=torch.float32)
     edges = low + torch.arange(bins[2] + 1, dtype=torch.float32) * ((high - low) / bins[2])
     edges[-1] = high
@@ -169,13 +169,13 @@ def bin_edges(bins: tuple[float, float, int]) -> Float[Tensor, " K"]:
 
 
 def flag_log_likelihood(log: Bool[Tensor, " E"], simulated: Bool[Tensor, "R E"]) -> Float[Tensor, " E"]:
-    """ln of the share of rollouts, smoothed, that agree with the log."""
+    """Return ln of the share of rollouts, smoothed, that agree with the log."""
     agree = (simulated == log).float().sum(0)
     return ((agree + _FLAGGED) / (len(simulated) + 2 * _FLAGGED)).log()
 
 
 def speed_mask(valid: Bool[Tensor, "*batch T"]) -> Bool[Tensor, "*batch T"]:
-    """Where the steps before and after are valid; the step itself may be not. False at both ends.
+    """Return where the steps before and after are valid; the step itself need not be. False at both ends.
 
     Applied to itself it is the mask of the acceleration.
     """
@@ -185,7 +185,7 @@ def speed_mask(valid: Bool[Tensor, "*batch T"]) -> Bool[Tensor, "*batch T"]:
 
 
 def _mask(valid: Tensor, kind: Tensor, name: str) -> Tensor:
-    """Where a component's likelihood counts: [E, 80], or [E] of yes or no."""
+    """Return where a component's likelihood counts: [E, 80], or [E] of yes or no."""
     if name in _FLAGS:
         return torch.ones_like(valid[:, 0])
     if name in {"linear_speed", "angular_speed"}:
@@ -198,8 +198,8 @@ def _mask(valid: Tensor, kind: Tensor, name: str) -> Tensor:
 
 
 def _ever(features: WosacFeatures, flag: str, *, vehicles: bool = False) -> tuple[Tensor, Tensor]:
-    """Whether a flag is set at any step at which the log is valid, [E] of the log and [R, E] of the rollouts; of
-    vehicles alone, if asked for.
+    """Return whether a flag is set at any step at which the log is valid, [E] of the log and [R, E] of the rollouts;
+    of vehicles alone, if asked for.
     """
     log, simulated = ((source[flag] & features.log_valid).any(-1) for source in (features.log, features.simulated))
     kind = (features.object_type == VEHICLE) | (not vehicles)
