@@ -1,4 +1,4 @@
-"""What an agent observes (paper, section IV-C): nearest objects and nearest map and light points, in its own frame.
+"""The observation of an agent (paper, section IV-C): the nearest objects, map points and lights, in its own frame.
 
 Shapes: M rows (any flattened batch), N observing agents, A agents of the scene, O objects, P points of a scene,
 K points that each observes.

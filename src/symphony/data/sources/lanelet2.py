@@ -90,7 +90,7 @@ class Lanelet:
 
     @property
     def bounds(self) -> tuple[Doubles, Doubles]:
-        """Both bounds, with the same number of points."""
+        """The left and the right bound, with the same number of points."""
         return lines.matched(self.left.line, self.right.line, f"lanelet {self.lanelet_id}")
 
     @property
