@@ -112,7 +112,7 @@ def make(
     place.mkdir(parents=True)
     (place / "config.json").write_text(to_json(without_paths(out)), encoding="utf-8")
     (place / FILE).write_text(to_json(changed), encoding="utf-8")
-    # A checkpoint holds random states too: always the same ones here, as nobody goes on from it.
+    # A checkpoint holds random states too: always the same ones here, as no run goes on from it.
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002
     torch.manual_seed(0)

@@ -108,7 +108,7 @@ HOW: dict[str, dict[str, Any]] = {
     "brute force": {},
     "matmul": {"unit": "operations", "warm": 2},
 }
-"""Of the workloads."""
+"""How the workloads are measured."""
 CURVES: dict[str, dict[int, Row]] = {
     "scenes B": {n: Row(work=partial(rings, 16, 200, count=n)) for n in (1, 4, 16, 64)},
     "agents A": {n: Row(work=partial(rings, 16, 200, count=16, agents=n)) for n in (2, 8, 32, 128)},

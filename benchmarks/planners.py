@@ -19,7 +19,7 @@ from symphony.collectors import BeamSearchPlanner, with_rows
 
 ROWS, SEEDS, STEPS = 8, 3, {"pendulum": 60, "point": 40, "pole": 60}
 HORIZON, ROUNDS, CANDIDATES = 12, 4, 64
-"""Of an action 4 x 64 x 12 steps are simulated, by the beam search in one round of 256 branches."""
+"""An action takes 4 x 64 x 12 simulated steps, in the beam search one round of 256 branches."""
 
 
 class Plane(EnvBase):

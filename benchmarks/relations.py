@@ -53,8 +53,8 @@ STATEMENTS: tuple[tuple[str, str, str, str | float], ...] = (
     ("curvature_jsd", "mgail", "mgail_ts", "rises"),
     ("curvature_jsd", "mgail_ts", "mgail_ts_h", "falls"),
 )
-"""What the paper's tables say: a metric, from which method to which, and what it does: a number is how many times it
-falls at least. The divergence must do so beyond its sampling."""
+"""The statements of the paper's tables: a metric, from which method to which, and what it does: a number is how many
+times it falls at least. The divergence must do so beyond its sampling."""
 
 Relation = dict[str, Any]
 """A statement beside our numbers, see :func:`relations`."""
@@ -212,7 +212,7 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("--paired", metavar="METHOD")
     given = parser.parse_args(args)
     entries, _ = collect(given.runs, given.setting, given.evaluation)
-    compare(entries, given.setting)  # or complain of what is not comparable
+    compare(entries, given.setting)  # fail if they are not comparable
     if given.paired is not None:
         print("\n".join(paired_lines(entries, given.paired)))
         return

@@ -75,7 +75,7 @@ class Careful:
         last = (self.route[-1] - self.route[-2]) / (self.arc[-1] - self.arc[-2])
         points = np.stack([np.interp(along, self.arc, axis) for axis in self.route.T], -1)
         points = points + np.maximum(along - self.arc[-1], 0.0)[:, None] * last
-        # From where it stood beside the route it comes to it within some 20 m.
+        # From beside the route, where it stood, it comes onto it within some 20 m.
         return points + self.aside * np.exp(-((along[:, None] / 10.0) ** 2))
 
 

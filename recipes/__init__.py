@@ -19,7 +19,7 @@ from symphony.training.processes import processes
 __all__ = ["Recipe", "recipe_of", "train", "trainer_of"]
 
 Recipe = Callable[[TrainConfig, Processes], Trainer]
-"""What builds the trainer of a run."""
+"""A function that builds the trainer of a run."""
 
 
 def recipe_of(method: Method) -> Recipe:

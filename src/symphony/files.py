@@ -105,7 +105,7 @@ class Lock(AbstractContextManager["Lock"]):
         who = f"{os.getpid()} on {socket.gethostname()}: {' '.join([program, *sys.argv[1:2]])}"
         with naming(self.output):
             path.parent.mkdir(parents=True, exist_ok=True)
-            while not _is_at(file := self._taken(), path):  # who had it has removed it meanwhile
+            while not _is_at(file := self._taken(), path):  # its holder has removed it meanwhile
                 os.close(file)
             os.ftruncate(file, 0)
             os.pwrite(file, who.encode(errors="replace"), 0)

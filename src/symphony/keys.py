@@ -14,7 +14,7 @@ PLANNER: Key = "planner"  # [..., P] int64: numbers of the planners that drive t
 PLANNED: Key = "planned"  # [..., P, 4]: x, y, heading, speed that planners give these at the next step
 NOISE_PLAN: Key = "noise_plan"  # [..., T, N] or [..., T, N, 2]: NOISE of all steps of a rollout
 
-# Padding is not valid; in open traffic neither are agents that are not there yet (they are waiting) or no more.
+# Padding is not valid; in open traffic neither are agents before they enter (they are waiting) or after they left.
 VALID: Key = ("agents", "valid")  # [..., N] bool
 WAITING: Key = ("agents", "waiting")  # [..., N] bool
 STATE: Key = ("agents", "state")  # [..., N, 4]: x, y, heading, speed
@@ -36,7 +36,7 @@ ROLLOUT: Key = ("agents", "rollout")  # [..., N] bool: the action is of a rollou
 WEIGHT: Key = (
     "agents",
     "weight",
-)  # [..., N]: of an action of a rollout, negative where it shall become less likely
+)  # [..., N]: of an action of a rollout, negative where it should become less likely
 
 OWN: Key = ("agents", "observation", "own")  # [..., N, Fs]
 OBJECTS: Key = ("agents", "observation", "objects")  # [..., N, O, Fo]

@@ -20,8 +20,8 @@ class Stream(IntEnum):
     GOALS = 1 << 40  # routes of the agents of a scene
     PRUNING = (1 << 40) + 1  # which branches go on
     PLANNERS = (1 << 40) + 3  # seeds of the planners of egos
-    ENTRIES = (1 << 40) + 6  # who enters past the log
-    WALKS = (1 << 40) + 5  # how people walk whom nobody drives
+    ENTRIES = (1 << 40) + 6  # vehicles that enter past the log
+    WALKS = (1 << 40) + 5  # walks of people that are not driven
     BACKTRACKING = 1 << 41  # lines that go back, each of its tries: this and how many there were
 
 

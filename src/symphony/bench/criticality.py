@@ -27,7 +27,7 @@ LONGEST = 3.0
 GENTLE, HARD = 2.0, 6.0
 """m/s² of braking at which it begins to be critical, and at which it is as critical as a collision."""
 CROSSING = 0.35
-"""Radians between two headings from which one way crosses another."""
+"""Radians between two headings from which on one path crosses another."""
 NEAR_EDGE = 0.5
 """Metres to the road's boundary below which it is critical."""
 
@@ -103,7 +103,7 @@ def _encroachment(world: World, segment: RunSegment, seen: NDArray[np.int64], eg
     mine, theirs = shapely.STRtree(_boxes(world, who, step)).query(ego, predicate="intersects")
     mine, who, step = seen[mine], who[theirs], step[theirs]
     apart = np.abs(mine - step) * segment.dt
-    # Who follows in a lane comes to each place soon after: that is a headway.
+    # A follower in a lane reaches each place soon after: that is a headway.
     turn = world.heading[segment.ego, mine] - world.heading[who, step]
     crosses = np.abs((turn + np.pi) % (2 * np.pi) - np.pi) > CROSSING
     if world.height is not None:

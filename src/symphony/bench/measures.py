@@ -132,7 +132,7 @@ def _rate_bound(value: NDArray[np.float64], group: NDArray[np.int64], groups: in
             np.append(value, np.ones(more)), np.ones(runs + more), np.append(group, np.full(more, groups))
         )
         count = mean * (1 - mean) / error**2 if mean and error else float(runs)
-        # Few groups tell their own scatter badly.
+        # The scatter of few groups is poorly known.
         count *= (t_quantile(confidence, runs - 1) / t_quantile(confidence, groups - 1)) ** 2
         count = min(count, float(runs))
     rest = (1 - rate) * count

@@ -22,7 +22,7 @@ Reals = NDArray[np.float64]
 LEAST_TTC = 0.95
 """Seconds to a collision that must be left at every step."""
 STANDS = 5.0
-"""Metres of the log's progress below which there is none to make."""
+"""Metres of the log's progress below which a run has no progress to make."""
 MOST_ACCELERATION, MOST_BRAKING, MOST_SIDEWAYS = 2.40, 4.05, 4.89
 """m/s² that are comfortable: along the heading, against it, across."""
 MOST_JERK, MOST_JERK_ALONG = 8.37, 4.13
@@ -32,7 +32,7 @@ MOST_YAW_RATE, MOST_YAW_ACCELERATION = 0.95, 1.93
 WINDOW = 1.5
 """Seconds over which derivatives are fitted."""
 _OBJECT_HIT = 0.5
-"""What is left of the score after a collision at fault with an object that is no road user."""
+"""Share of the score left after a collision at fault with an object that is not a road user."""
 
 
 class PDM(NamedTuple):

@@ -42,13 +42,13 @@ from symphony.saved.rollouts import SavedRollouts, saved_rollouts
 from symphony.saved.saving import has_ego, plain_settings
 
 PERIOD = 0.4
-"""Seconds after which branches go on or not."""
+"""Seconds after which branches are resampled."""
 TOGETHER = 4
 """Run segments simulated at a time, unless more are asked for."""
 KEPT = 3
 """Failing runs of a segment that are kept, at most."""
 FEW = 4
-"""Trees that show it, fewer than which are too few to tell its rate by."""
+"""Number of trees that show the event, with fewer than which its rate is rough."""
 
 
 def resampling() -> Systematic:
@@ -151,7 +151,7 @@ def hunt(path: Path, hunter: Hunt, progress: Callable[[int, int], None] | None =
         SymphonyError: as for :func:`symphony.saved.saving.save_simulation`.
     """
     agent, data, config = hunter.agent, hunter.dataset, hunter.config
-    planner_maker(hunter.planner)  # or complain before anything is simulated
+    planner_maker(hunter.planner)  # fail before anything is simulated
     rates = [name for name, measure in MEASURES.items() if measure.kind == "rate"]
     if hunter.metric not in rates:
         raise ConfigError(f"metric is one of {', '.join(rates)}, not '{hunter.metric}'")

@@ -30,7 +30,7 @@ DROP = 10.0
 """Points of score that a run must lose against the baseline's to be called a regression."""
 EVENTS = {"failed": "fails", "at_fault_collision": "collides, at fault"}
 EVENTS |= {"red_lights": "runs a red light", "offroad_time": "leaves the road"}
-"""What a run of the baseline's did not show, for a regression; in words."""
+"""Events that are a regression if the baseline's run did not show them, in words."""
 
 Status = Literal["passes", "fails", "undecided"]
 
@@ -177,7 +177,7 @@ def _drive(suite: Suite, pair: Pair, progress: Progress) -> None:
     """Simulate a pair part by part, until its verdict is clear."""
     began, config = time.perf_counter(), pair.crowd.config
     agent = load_agent(pair.crowd.agent, config.device)
-    # Beside log playback nobody else is simulated.
+    # Beside log playback no other agent is simulated.
     others = 1 if agent.policy is None else agent.interactive
     pair.report.agent = pair.name
     for part in range(min(ROUNDS, len(suite.items))):

@@ -26,9 +26,9 @@ from symphony.learning.demonstrations import evenly_spaced
 from symphony.planners.interface import planner_maker
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
-"""What planners and crowds may be called: these are folders, too."""
+"""The names that planners and crowds may have: folders are named after them."""
 BUILTIN = "builtin:"
-"""Before the split of the run segments that come with the package."""
+"""The prefix before the split of the run segments that come with the package."""
 _NUMBER = (int, float)
 _CROWD = {"interactive": (int, str), "others": str, "search": str, "score": str, "branches": int}
 _CROWD |= {"radius": _NUMBER, "duration": int}

@@ -50,7 +50,7 @@ GONE = {
     "wosac score --features": "`symphony.wosac.scorer.compute_features` gives them in Python",
     "simulate --agents": "the agent is named without an option: `symphony simulate RUN --data DIR --out SIM`",
 }
-"""Commands and options that are gone, and what takes their place."""
+"""Removed commands and options, and what replaces them."""
 POSITIONAL = get_args(tyro.conf.Positional[int])[1]
 
 DESCRIPTION = """Realistic and diverse traffic agents learned from logged driving.
@@ -98,7 +98,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except errors.ConfigError as error:
         return _complain(error, USAGE)
     except SystemExit as stop:
-        # Help or a complaint was printed; whoever read it may have gone, say `head`.
+        # Help or an error was printed; its reader, such as `head`, may have gone.
         return guarded(lambda: None) or int(stop.code or 0)
 
     def run() -> None:
@@ -140,7 +140,7 @@ def guarded(action: Callable[[], object]) -> int:
             action()
             sys.stdout.flush()
     except BrokenPipeError:
-        # The reader of our output has gone, say `head`; Python would complain once more as it ends.
+        # The reader of our output, such as `head`, has gone; Python would print another error as it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except KeyboardInterrupt as stop:

@@ -39,7 +39,7 @@ class Train(shared.Command):
         from symphony.agents.choice import best_of, choose
 
         folder, validation = symphony.train(self.config), self.config.validation
-        if os.environ.get("RANK", "0") != "0":  # of the processes that torchrun starts, one speaks
+        if os.environ.get("RANK", "0") != "0":  # of the processes that torchrun starts, one prints
             return
         score = "the last one; nothing was validated, see --validation.data"
         if (best := best_of(choose(folder, "last"))) is not None:
@@ -64,7 +64,7 @@ class Evaluate(shared.Simulation):
     keep: bool = True  # Leave the folder of the run as it is.
     #: Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout.
     metric: tuple[str, ...] = ()
-    #: More scores for the record and `symphony table`: `wosac` (2025), 32 rollouts of everyone (see docs/wosac.md).
+    #: More scores for the record and `symphony table`: `wosac` (2025), 32 rollouts of all agents (see docs/wosac.md).
     metrics: tuple[Literal["wosac"], ...] = ()
 
     def __post_init__(self) -> None:
@@ -87,7 +87,7 @@ class Evaluate(shared.Simulation):
             from symphony.wosac.table import wosac_table
 
             rows, settings = chosen or range(len(store)), WosacSettings.of(config)
-            scorable(store, rows, settings.future)  # complains now, not after the work
+            scorable(store, rows, settings.future)  # fails now, not after the work
         shown = [] if self.figure is None else evenly_spaced(len(chosen or store), PANELS)
         clips: list[render.Clip] = []
         writer: folder.RolloutWriter | None = None
@@ -173,7 +173,7 @@ class Demo(shared.Command):
     """
 
     out: Path = Path("out/demo")  # Folder for agent, pictures, numbers; an earlier demo there is replaced.
-    steps: Count = 1500  # Updates of the agent that is learned.
+    steps: Count = 1500  # Updates of the agent that is trained.
     rollouts: Count = 16  # Rollouts per run segment in the evaluation.
     seed: int = 0  # Seed of the training and of the rollouts.
 

@@ -19,7 +19,7 @@ from symphony.errors import ConfigError
 READER_OPTIONS = {"interaction": ("egos", "window", "stride", "motion"), "commonroad": ("egos",)}
 """Options of `data convert` that only some readers take; the first takes all of them."""
 LISTS = {"path", "files", "settings", "reasons", "odd_examples", "skipped", "skipped_details"}
-"""What `data info` tells in its JSON alone."""
+"""Entries that `data info` shows in its JSON only."""
 
 
 class Generate(shared.Command):
@@ -30,7 +30,7 @@ class Generate(shared.Command):
     """
 
     out: Path  # Folder of the store; with a preset, of its stores `train`, `validation` and `test`.
-    count: Annotated[int | None, Bounds(1)] = None  # Number of run segments; needed unless a preset says it.
+    count: Annotated[int | None, Bounds(1)] = None  # Number of run segments; needed unless a preset gives it.
     #: Standard set to make: 2 000 + 200 + 500 run segments, or 10 000 + 200 + 1 000, of 10 s.
     preset: Literal["town-small", "town"] | None = None
     seed: int = 0  # Seed of the networks: another one gives other networks.
@@ -40,7 +40,7 @@ class Generate(shared.Command):
     #: your own: OpenDRIVE (.xodr), OpenStreetMap (.osm) or SUMO (.net.xml).
     kinds: str = "town"
     duration: Literal[10, 20, 30] = 10  # Seconds of a run segment.
-    interactive: int = 2  # Vehicles that must be there and move at the first step.
+    interactive: int = 2  # Vehicles that must be present and move at the first step.
     workers: shared.Workers = 1
     engine: shared.EngineName = "local"
     json: shared.Json = None
@@ -93,7 +93,7 @@ class Quality(shared.Command):
     """Measure the driving in a store: is it physical, varied, and within reach of the action space?"""
 
     store: shared.Store
-    interactive: Count = 2  # Interactive agents per run segment: they are what is measured.
+    interactive: Count = 2  # Interactive agents per run segment, which are measured.
     json: shared.Json = None
 
     def __call__(self) -> None:
@@ -116,7 +116,7 @@ class Hardest(shared.Command):
     """
 
     store: Annotated[Positional[Path], arg(metavar="DIR")]  # Folder of the store, or of rollouts.
-    count: Count = 20  # Number of run segments, or of rollouts, that are listed.
+    count: Count = 20  # Number of run segments, or of rollouts, to list.
     ids: bool = False  # Print only the ids of their segments, for the option --segments of other commands.
     json: shared.Json = None
 
@@ -201,7 +201,7 @@ class Prepare(shared.Command):
 
     store: shared.Store
     method: Method = "bc_ts_h"  # Method to train, which decides the actions and whether there are routes.
-    duration: Natural = 0  # Seconds of each run segment that are to be used; 0: all there are.
+    duration: Natural = 0  # Seconds of each run segment to use; 0: all.
     accelerations: Annotated[int, Bounds(3, 1001)] = 7  # Levels of acceleration of the agent (methods bc*).
     workers: shared.Workers = 1
     engine: shared.EngineName = "local"
@@ -240,7 +240,7 @@ class Info(shared.Command):
 
     store: shared.Store
     json: shared.Json = None
-    interactive: Natural = 2  # Interactive agents to choose in each segment, and to count why; 0: none.
+    interactive: Natural = 2  # Interactive agents to choose in each segment, with counts of the reasons; 0: none.
 
     def __call__(self) -> None:
         from symphony.data.convert import info

@@ -101,10 +101,10 @@ class Hunt(shared.Command):
     metric: Rate = "at_fault_collision_rate"  # Rate to estimate, in percent of runs (see docs/metrics.md).
     segments: shared.Segments = ()
     trust_code: shared.TrustCode = False
-    trees: Annotated[int, checks.Bounds(4)] = 8  # Independent estimates of a run segment, by a tree each.
+    trees: Annotated[int, checks.Bounds(4)] = 8  # Independent estimates of a run segment, one tree each.
     branches: Annotated[int, checks.Bounds(2)] = 32  # Rollouts of a tree; near a collision they are copied.
     interactive: checks.Natural = 0  # Agents that are driven, the ego included; 0: as the agent was trained.
-    duration: checks.Natural = 0  # Seconds that are simulated; 0: as many as the agent was trained with.
+    duration: checks.Natural = 0  # Seconds to simulate; 0: as many as the agent was trained with.
     seed: int = 0  # Seed of everything that is drawn at random.
     workers: shared.Workers = 1
     engine: shared.EngineName = "local"

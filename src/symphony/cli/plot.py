@@ -25,7 +25,7 @@ class Curvature(shared.Command):
 
     runs: Runs
     out: shared.Picture
-    evaluation: shared.Names = ()  # Name of the evaluation of a run that counts, as in `symphony table`.
+    evaluation: shared.Names = ()  # Name of the evaluation to take of a run, as in `symphony table`.
 
     def __call__(self) -> None:
         import numpy as np
@@ -54,8 +54,8 @@ class Curves(shared.Command):
 
     runs: Runs
     out: shared.Picture
-    metrics: shared.Names = ()  # Names of the only metrics to draw; by default all there are.
-    #: Share of a run's records that a point is averaged over; 0 for not smoothing.
+    metrics: shared.Names = ()  # Names of the metrics to draw; by default all.
+    #: Share of a run's records that a point is averaged over; 0 for no smoothing.
     window: Annotated[float, Bounds(0, 1)] = 0.1
 
     def __call__(self) -> None:

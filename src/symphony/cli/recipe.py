@@ -30,9 +30,9 @@ def main(recipe: Any, description: str | None, args: Sequence[str] | None = None
     from symphony.recipes import train
 
     settings = tyro.cli(Arguments, description=description, args=expanded([recipe.__name__, *args]))
-    symphony.SegmentStore(settings.test)  # complains now, not after the training
+    symphony.SegmentStore(settings.test)  # fails now, not after the training
     folder, training = train(settings.config, recipe), settings.config
     how: Any = {"seed": training.seed, "device": training.device, "compile": training.compile}
     config = symphony.EvaluateConfig(rollouts=settings.rollouts, **how)
-    # What its folder names is the user's own words of a moment ago.
+    # Its folder names what the user typed a moment ago.
     Evaluate(agent=str(folder), data=settings.test, trust_code=True, config=config)()

@@ -32,10 +32,10 @@ class Simulate(shared.Simulation):
     #: has 4 by default, or as many as its rollouts, if those are more.
     planner: Annotated[tuple[str, ...], arg(metavar="NAME [ID=NAME ...]")] = ()
     planner_seconds: float = 60.0  # Seconds that a planner has for one answer; a longer one fails the run.
-    #: Least number of runs (rollouts of a segment), evenly spread over segments, in place of `rollouts`; 0: of all.
+    #: Least number of runs (rollouts of a segment), spread evenly over segments; 0: `rollouts` of every segment.
     runs: checks.Natural = 0
     #: Goals of agents, by their ids in the source: `7=lane:103` for a route over the lane of that id, `7=12.5,-40`
-    #: for one that comes past a point (metres, in the frame of the segment); all others as the agent draws them.
+    #: for one that passes a point (metres, in the frame of the segment); all others as the agent draws them.
     goal: Annotated[tuple[str, ...], arg(metavar="ID=PLACE ...")] = ()
     tree: bool = True  # Leave out the branches that a search pruned.
     config: Annotated[evaluation.SimulateConfig, arg(name="")] = field(default_factory=evaluation.SimulateConfig)
@@ -61,7 +61,7 @@ class Simulate(shared.Simulation):
         if self.runs:
             count, config = spread_runs(agent, config, self.runs, len(store), planned=bool(planner))
             chosen = evenly_spaced(len(store), count)
-        # Beside log playback nobody else is simulated.
+        # Beside log playback no other agent is simulated.
         crowd: dict[str, Any] = {"default": 1 if planner and agent.policy is None else agent.interactive}
         crowd |= {"routes": bool(planner or self.goal), "also": drives}
         dataset = crowd_dataset(store, agent, config, chosen or None, **crowd)
@@ -138,7 +138,7 @@ class Report(shared.Command):
 
     folder: shared.Saved
     out: shared.Folder = None  # Folder of the report; by default the same folder.
-    evaluated: Literal["interactive", "ego"] = "interactive"  # Evaluate all that are driven, or the ego.
+    evaluated: Literal["interactive", "ego"] = "interactive"  # Evaluate all driven agents, or the ego.
     view: bool = True  # Leave the page that plays the rollouts unwritten.
 
     def __call__(self) -> None:

@@ -175,7 +175,7 @@ def print_metrics(rows: Sequence[dict[str, Any]], title: str = "", *, details: b
             print_facts({name: value for name, value in row.items() if name != "agent"}, row["agent"])
     first, most = rows[0], max(row["rollouts"] for row in rows)
     driven = "all vehicles" if first["interactive"] == "all" else f"{first['interactive']} interactive agents"
-    if first["interactive"] not in ("all", 1, 2):  # a segment with fewer has those that there are
+    if first["interactive"] not in ("all", 1, 2):  # a segment with fewer has all of them
         driven = f"up to {driven}"
     text = f"{first['segments']} run segments of {first['groups']} recordings, {driven} each, up to {most} rollouts"
     say(f"{text}; ± standard error over recordings, ≤ exact bound of a zero (95 %); seed {first['seed']}")

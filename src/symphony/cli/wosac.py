@@ -36,7 +36,7 @@ class Score(shared.Command):
     rollouts: Annotated[Path, arg(metavar="FILE|DIR")]
     config: Year = "2025"
     json: shared.Json = None
-    per_object: bool = False  # Write the numbers of each scored object into the JSON, too.
+    per_object: bool = False  # Also write the numbers of each scored object into the JSON.
     partial: bool = False  # Leave out scenarios without rollouts; otherwise each must have some.
     strict: Strict = False
     workers: shared.Workers = 1
@@ -98,7 +98,7 @@ class Submit(shared.Command):
     data: Scenarios
     out: Annotated[Path, shared.Result(), arg(metavar="FILE")]  # File to write (.tar.gz).
     meta: Annotated[SubmissionMeta, arg(name="")]
-    shards: checks.Natural = 0  # Number of files in the archive; 0: 150, or one a scenario if they are fewer.
+    shards: checks.Natural = 0  # Number of files in the archive; 0: 150, or one per scenario if those are fewer.
     trust_code: shared.TrustCode = False
     settings: Annotated[WosacSettings, arg(name="")] = field(default_factory=WosacSettings)
 

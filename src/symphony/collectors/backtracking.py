@@ -61,7 +61,7 @@ class Course:
     def __init__(self, rule: Backtrack, lines: int, periods: int, device: torch.device) -> None:
         self.rule, self.periods = rule, periods
         self.back = torch.tensor(rule.back, device=device)
-        # Tries since it came past its last trouble, the place of that, and periods simulated again.
+        # Tries since it passed its last bad period, the place of that, and periods simulated again.
         self.at, self.times, self.tries, self.front, self.again = torch.zeros(
             5, lines, dtype=torch.int64, device=device
         )
@@ -140,7 +140,7 @@ def follow(
             all_scores.index_copy_(0, place + k, run.scores[:, 0, k])
             all_alive.index_copy_(0, place + k, alive[:, 0, k])
         all_totals.index_copy_(0, line * periods + at, totals)
-        # An episode that has ended can't be bad any more; who goes back goes to before its end.
+        # An episode that has ended can't be bad any more; a line that goes back goes to before its end.
         goes = course.judge(line, ~(totals <= rule.threshold) & alive[:, 0, 0]).nonzero().squeeze(-1)
         now, over = run.after.select(*entries), run.ended.index_fill(0, goes, False)
         if len(goes):

@@ -34,7 +34,7 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 Score = Callable[[TensorDictBase], Tensor]
 Aggregation = Callable[[Tensor], Tensor]
 PROGRAMS = 64
-"""Programs that compiled searches of a process may have, at most: one for all states of a shape."""
+"""The most programs that compiled searches of a process may have: one for all states of a shape."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def beam_search(
     check_branching(env, start)
     whole = branched_env(env, start.shape)
     one_step = _compiled(whole, compile_step) if compile_step else _step
-    # What a policy only writes is made anew at each step; all else, such as its memory, is carried on.
+    # What a policy only writes is made again at each step; all else, such as its memory, is carried on.
     written = [key for key in getattr(policy, "out_keys", ()) if key not in getattr(policy, "in_keys", ())]
     how = start.shape, policy, score, aggregate, keep, until_done, one_step, start, written
     # One program for lines that go back, also when the last of them are few.

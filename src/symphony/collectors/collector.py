@@ -84,7 +84,7 @@ class BeamSearchCollector(Collector):
             raise ValueError(f"leaves must be 1 ... {branches} branches, keep_tree needs all, is {leaves}")
         if kwargs.get("split_trajs") or not kwargs.get("extend_buffer", True):
             raise ValueError("a search has no single steps: neither split_trajs nor extend_buffer=False")
-        # Multi-process collectors pass their own choice; here each batch is made anew, from a reset.
+        # Multi-process collectors pass their own choice; here each batch begins with a reset.
         kwargs["use_buffers"], kwargs["reset_at_each_iter"] = False, True
         if kwargs.get("auto_register_policy_transforms") is None:
             # What TorchRL 0.14 does when left unset, minus its warning about any policy that is a module.

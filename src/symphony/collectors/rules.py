@@ -69,7 +69,7 @@ class Aggregate:
 
 
 max_then_sum = Aggregate("max", "sum")
-"""The paper's: the worst moment of each agent, added up."""
+"""The paper's aggregate: the worst moment of each agent, added up."""
 mean_then_sum = Aggregate("mean", "sum")
 """The average of each agent over the period, added up."""
 
@@ -288,7 +288,7 @@ class ReplaceBad:
         own = (good[..., None, :] & same).any(-1)
         candidates = good[..., None, :] & (same | ~own[..., :, None])
         waiting = ~good[..., None, :] & torch.where(own[..., :, None], same, ~own[..., None, :])
-        # Those that wait for the same branches take them by turns, from one on that the noise picks.
+        # Those that wait for the same branches take them in turn, from one on that the noise picks.
         turn = (waiting & (slots[..., None, :] < slots[..., :, None])).sum(-1)
         number = candidates.sum(-1)
         first = (noise.double()[..., None] * number).long()
@@ -405,13 +405,13 @@ def checked(
     try:
         parents = rule(totals, noise, groups) if takes_groups(rule) else rule(totals, noise)
         what = f"{parents.dtype} {tuple(parents.shape)}"
-    except Exception as error:  # whatever a rule of others raises
+    except Exception as error:  # whatever a user's rule raises
         if own or isinstance(error, torch.OutOfMemoryError):
             raise
         raise ValueError(f"{rule}: {type(error).__name__}: {error}") from error
     if parents.dtype != torch.int64 or parents.shape != totals.shape:
         raise ValueError(f"a pruning rule must return int64 {tuple(totals.shape)}, {rule} returned {what}")
-    # Looking at the values waits for the device; only rules of others need it.
+    # Looking at the values waits for the device; only users' rules need it.
     if not own and parents.numel() and not bool(((parents >= 0) & (parents < totals.shape[-1])).all()):
         raise ValueError(f"{rule} returned branches outside of 0 ... {totals.shape[-1] - 1}")
     return parents

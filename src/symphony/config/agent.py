@@ -16,7 +16,7 @@ Score = Literal["discriminator", "flags", "rule"]
 Rule = Annotated[str, Names(("best", "systematic", "replace"))]
 Own = Annotated[str, Names(["paper"])]
 MOST = 10_000
-"""What the file of an agent may ask for, at most: agents, points of each kind, branches, the width of a network."""
+"""The most that the file of an agent may ask for: agents, points of each kind, branches, the width of a network."""
 Size = Annotated[int, Bounds(1, MOST)]
 
 
@@ -31,11 +31,11 @@ class AgentConfig(Settings):
     #: Nearest lights that the agent observes beside the points, however far they are (the paper: none).
     num_lights: Annotated[int, Bounds(0, MOST)] = 0
     #: Inputs of the policy. `paper`: objects and points around; `gaps`: also how far the agent is from the boxes of
-    #: objects, now and within the next 2 s, were everyone to keep speed and course, and with goals where they are
-    #: along its route.
+    #: objects, now and within the next 2 s if all keep speed and course, and with goals where they are along its
+    #: route.
     features: Literal["paper", "gaps"] = "paper"
-    #: What the goal policy observes of each route. `points`, of agents from before it could see more: where it is
-    #: every 12 m; `turns`: also where it begins and how much it turns every 3 m, which tells where it changes lanes.
+    #: What the goal policy observes of each route. `points`, for older agents: where it is every 12 m; `turns`: also
+    #: where it begins and how much it turns every 3 m, which tells where it changes lanes.
     goal_features: Annotated[Literal["points", "turns"], Fixed, Suppress] = field(
         default="turns", metadata={"before": "points"}
     )
@@ -68,8 +68,7 @@ class DiscriminatorConfig(Settings):
     """The network that scores realism, and how it learns."""
 
     #: Inputs of the discriminator. `paper`: objects and points around; `clearance`: also gaps between boxes and
-    #: distances to the road's edge; `foresight`: also the gaps within the next 2 s, were everyone to keep speed and
-    #: course.
+    #: distances to the road's edge; `foresight`: also the gaps within the next 2 s if all keep speed and course.
     features: Features = "clearance"
     #: Width of the discriminator's encoders; its head is twice as wide.
     hidden: Annotated[Size, Suppress] = 32
@@ -95,14 +94,14 @@ class SearchConfig(Settings):
     temperature: Positive = 0.6  # Temperature of rule `systematic`: the lower, the stricter.
     #: Highest score, in logits of the discriminator, with which rule `replace` lets a branch go on.
     threshold: float = 1.0
-    #: Who shares goals: all branches of a `tree` (the paper), or nobody, as each `branch` draws its own.
+    #: Sharing of goals: by all branches of a `tree` (the paper), or not at all, as each `branch` draws its own.
     goals: Literal["tree", "branch"] = "tree"
-    #: Search that the agent is simulated with unless something else is asked for: `tree` (the paper), `backtrack`.
+    #: Search that the agent is simulated with by default: `tree` (the paper), `backtrack`.
     way: Annotated[Literal["tree", "backtrack"], Fixed, Suppress] = "tree"
     score: Annotated[Score, Fixed, Suppress] = "discriminator"  # Score that this search lowers.
     updates: Count = 10  # Updates made from the results of one search before the next.
-    #: States per update: so many of the surviving rollouts for the policy to learn from, and so many of all rollouts
-    #: and of the log for the discriminator; each is of all interactive agents of its run segment.
+    #: States per update: this many of the surviving rollouts for the policy to learn from, and this many of all
+    #: rollouts and of the log for the discriminator; each is of all interactive agents of its run segment.
     states: Count = 256
     _TRAINED: ClassVar = dict.fromkeys(("segments", "weight", "survivors"), ...)
     GONE: ClassVar = {"keep": 0.5, "aggregate": "max_then_sum", **_TRAINED}

@@ -31,7 +31,7 @@ MOST = 128
 TOGETHER = 64
 """Run segments simulated at a time, at most, unless more are asked for: with more, each costs no less."""
 SEARCHES = 600
-"""Searches, one after the other, from which on compiling their steps pays on a device: each saves some .4 s."""
+"""Searches in a row from which on compiling their steps pays off on a device: each saves some .4 s."""
 MOST_SECONDS = 1e6
 """Seconds that a planner can be given for an answer, at most."""
 
@@ -55,8 +55,8 @@ class SimulationConfig(Settings):
     #: `backtrack`: independent rollouts, each of which goes back and tries again where it is bad.
     search: Search = "agent"
     #: Score that a search lowers. `agent`: as is best for the agent (the discriminator, unless its card says
-    #: something else); `discriminator`: what the agent's own calls unreal; `flags`: collisions and time off the
-    #: road; `rule`: the same, and collisions within half a second, were everyone to keep speed and course.
+    #: something else); `discriminator`: what the agent's own one calls unreal; `flags`: collisions and time off the
+    #: road; `rule`: the same, and collisions within half a second if all keep speed and course.
     score: ScoreName = "agent"
     branches: Natural = 0  # Branches of each tree; 0: as many as the agent's `search.test-branches`.
     #: Rule that prunes trees: `agent` as it was trained, else see `search.rule` of training.
@@ -67,8 +67,8 @@ class SimulationConfig(Settings):
     #: Highest score of a good branch, for rule `replace` and for `backtrack`; by default as the agent was trained,
     #: and 0 for scores that count what is bad (`flags`, `rule`).
     threshold: float | None = None
-    #: Who shares goals: all branches of a `tree` (the paper), or nobody, as each `branch` draws its own; `agent`: as
-    #: the agent was trained.
+    #: Sharing of goals: by all branches of a `tree` (the paper), or not at all, as each `branch` draws its own;
+    #: `agent`: as the agent was trained.
     goals: Goals = "agent"
     #: Temperature of the draw of discrete actions: below 1 likely ones become likelier, above 1 the rare ones.
     action_temperature: Positive = 1.0
@@ -104,14 +104,14 @@ class EvaluateConfig(SimulationConfig):
     logged_goals: bool = False  # Give agents the routes of the log instead of sampled ones.
     #: Seconds of each run segment that are simulated; 0: as many as the agent was trained with.
     duration: Natural = 0
-    #: Agents per run segment that the agent drives, at most 128: the ego, then the nearest (in a segment with fewer
-    #: those that there are); 0: as many as it was trained with (2 for the baselines). `all`: every vehicle that moves
-    #: or stands in a lane, in open traffic.
+    #: Agents per run segment that the agent drives, at most 128: the ego, then the nearest (all of them in a segment
+    #: with fewer); 0: as many as it was trained with (2 for the baselines). `all`: every vehicle that moves or stands
+    #: in a lane, in open traffic.
     interactive: int | Literal["all"] = 0
     #: Metres from the ego within which vehicles beyond the first two must come in the log to be driven; 0: no limit.
     radius: NotNegative = 0.0
     #: Vehicles enter where the log brings them in and leave at the edge of the map, as they do with `all`; otherwise
-    #: the same ones are driven from the first step to the last.
+    #: the same agents are driven from the first step to the last.
     open_traffic: bool = False
     #: Driver of the other vehicles: the `log`, `constant_velocity`, `idm` (a car-follower, along the route of the
     #: log) or the agent itself (`learned`). They are not evaluated; traffic is open for all but the log.
@@ -149,8 +149,8 @@ class SimulateConfig(EvaluateConfig):
     #: Seconds of green, amber and all red of each phase of the traffic lights past the end of the log; by default
     #: they keep the cycle that the log shows, or take 25, 3 and 2.
     lights: tuple[float, ...] = ()
-    #: What becomes of agents whose boxes overlap: they `go-on`, `stop` for as long as they overlap, or are not there
-    #: from the next step on (`remove`), or until there is room where they came from (`respawn`).
+    #: What becomes of agents whose boxes overlap: they `go-on`, `stop` for as long as they overlap, or are gone from
+    #: the next step on (`remove`), or until there is room where they came from (`respawn`).
     after_collision: AfterCollision = "go-on"
 
     def __post_init__(self) -> None:
@@ -160,7 +160,7 @@ class SimulateConfig(EvaluateConfig):
 
 
 WosacScore = Literal["agent", "discriminator", "rule"]
-"""Scores without the true flags: what is simulated must not know beforehand what it is scored by."""
+"""Scores without the true flags: a simulation must not know beforehand what it is scored by."""
 FUTURE, DT = 80, 0.1
 """Steps that the challenge asks for, and the seconds between them."""
 
@@ -169,11 +169,11 @@ FUTURE, DT = 80, 0.1
 class WosacSettings(SimulationConfig):
     """Settings of the simulation; each of the 32 rollouts of a search comes from a tree of its own."""
 
-    #: Score that a search lowers. `agent`: as is best for the agent; `discriminator`: what the agent's own calls
-    #: unreal; `rule`: collisions, also those within half a second, were everyone to keep speed and course, and time
-    #: off the road.
+    #: Score that a search lowers. `agent`: as is best for the agent; `discriminator`: what the agent's own one calls
+    #: unreal; `rule`: collisions, also those within half a second if all keep speed and course, and time off the
+    #: road.
     score: WosacScore = "agent"
-    #: Give agents the routes of the log instead of sampled ones; of the score alone, since it tells them the future.
+    #: Give agents the routes of the log instead of sampled ones; for the score only, since it tells them the future.
     logged_goals: bool = False
     #: Seconds that are simulated and scored: the challenge's 8, or less for logs that are shorter. Scores of another
     #: horizon are those of an easier task; a submission has 8.

@@ -20,14 +20,14 @@ hierarchy), with tree search (TS), with both.
 """
 METHODS: tuple[str, ...] = get_args(Row)
 Method = Literal[Row, "bc_rl_h"]
-"""What there is a recipe for: also BC+H with a policy gradient (RL), which is none of the paper's."""
+"""Methods that have a recipe: also BC+H with a policy gradient (RL), which is not in the paper."""
 Cost = Literal["log_d", "non_saturating", "logit"]
 GOALS = 128
 """Expert routes per update of the goal policy."""
 DISCRIMINATOR_RATE = 1e-3
 """Learning rate of the discriminator's Adam, falling to a tenth along a cosine."""
 ROWS, AGE = 256, 32
-"""Run segments that a card searches in the time of 16, and updates that states may be old that are learned from."""
+"""Run segments that a card searches in the time of 16, and the greatest age, in updates, of states to learn from."""
 MAX_SEED = (1 << 40) - 1
 """Largest seed of a training, which derives a number from it for every update."""
 
@@ -89,8 +89,8 @@ class PerturbConfig(Settings):
 class PreviewConfig(Settings):
     """Settings of previews of an agent in training: animated rollouts, and distributions of what it does."""
 
-    #: Updates between previews, and one at the end of a run that has so many (0: never); by default this takes about
-    #: a hundredth of the time on a CPU, or less.
+    #: Updates between previews, and one at the end of a run of that length (0: never); by default this takes about a
+    #: hundredth of the time on a CPU, or less.
     every: Natural = 2000
 
 
@@ -116,7 +116,7 @@ class RunConfig(Settings):
     #: Mode of Weights & Biases; a plain file has the curves in any case. The variables WANDB_PROJECT, WANDB_RUN_GROUP
     #: and WANDB_TAGS name project, group and tags.
     wandb: Literal["offline", "online", "disabled"] = "offline"
-    device: str = "cpu"  # Device that learns: `cpu`, `cuda` or `cuda:N`.
+    device: str = "cpu"  # Device to train on: `cpu`, `cuda` or `cuda:N`.
     #: Compile the steps of searches, which takes minutes: `auto`, on a device where a run is long enough to win.
     compile: Compile = "auto"
 
@@ -132,7 +132,7 @@ class TrainConfig(RunConfig):
     duration: Natural = 0
     agent: AgentConfig = field(default_factory=AgentConfig)  # What the agent observes, its networks.
     segments: Annotated[Count, arg(name="batch")] = 16  # Run segments per update, and per search.
-    #: Searches made as one, for so many times `search.updates` to come; 0: one, on a device more (see `rows`).
+    #: Searches made together, for this many times `search.updates` to come; 0: one, on a device more (see `rows`).
     together: Annotated[Natural, Suppress] = 0
     states: Count = 1024  # Expert states per update, drawn from those segments.
     perturb: PerturbConfig = field(default_factory=PerturbConfig)  # Displaced expert states.

@@ -46,7 +46,7 @@ RANGES: dict[str, tuple[str, float, float, Any, str]] = {
     "off_lane": ("lanes", 0, 0.5, np.mean, "share of moving vehicles on no lane that runs their way"),
     "off_road": ("boundary", 0, 0.2, np.mean, "share of moving vehicles on the side not drivable"),
 }
-"""What is taken of the segments together: its check, least and most, how values are pooled, and what it is."""
+"""Numbers taken over all segments: check, least and most, how values are pooled, and what the number is."""
 OPTIONAL = ("neighbor_side", "neighbor_along", "lane_width", "speed_limit")
 """Numbers for which a format may have nothing to take them from."""
 

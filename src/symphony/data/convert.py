@@ -139,7 +139,7 @@ def make_part(task: Task) -> Path:
 def _entry(outcome: RunSegment | Skip, writer: StoreWriter) -> Any:
     if isinstance(outcome, Skip):
         return outcome.to_json()
-    # Of a name that comes twice the first is kept; whoever takes them out of the part sees it twice.
+    # Of a name that occurs twice the first is kept; the one that collects the parts sees it twice.
     if writer.has(outcome.segment_id):
         return writer.index_of(outcome.segment_id)
     odd = {**outcome.odd, **dict.fromkeys(oddities(outcome), "")}

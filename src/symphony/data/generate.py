@@ -32,7 +32,7 @@ SPLITS: tuple[Split, ...] = get_args(Split)
 DURATIONS = (10, 20, 30)  # seconds a segment may last
 
 VERSION = 1
-"""Of this generator: another one may give other segments for the same plan, so a store is not continued by it."""
+"""Version of this generator: another may give other segments for the same plan, and does not continue a store."""
 FIRST_NETWORK = 1_000_000  # seeds of networks below this are left to the built-in set and to experiments
 BLOCK = 100_000  # networks that a seed has for each split
 MAX_SEED = 9_999
@@ -62,8 +62,8 @@ class Plan:
     segments: int  # how many
     seed: int = 0  # another seed is another set of networks
     split: Split = "train"  # training, validation and test sets never share a network, whatever their seeds
-    #: of networks, which take turns; one named twice comes twice as often. A file of roads of one's own is a
-    #: kind, too; its roads are the same for every split and seed, the traffic is another.
+    #: of networks, which take turns; one named twice comes twice as often. A file of your own roads is a kind, too;
+    #: its roads are the same for every split and seed, the traffic is another.
     kinds: tuple[str, ...] = ("town",)
     duration: int = 10  # seconds of a segment, one of :data:`DURATIONS`
     interactive: int = 2  # moving vehicles a segment must have at its first step (N_I)
@@ -107,7 +107,7 @@ class Preset(NamedTuple):
 
 
 MADE_WITH = "SUMO 1.28.0 on Linux, x86-64"
-"""What the checksums of the standard sets were taken with: other versions or processors may give others."""
+"""The simulator that gave the checksums of the standard sets: other versions or processors may give others."""
 
 
 def _preset(counts: tuple[int, int, int], *checksums: str) -> Preset:
@@ -156,7 +156,7 @@ class Harvest:
 
 def harvest(task: Task) -> Harvest:
     """Make one network, simulate it, and take :data:`PER_NETWORK` segments from as many of its maps as there are."""
-    begin = sum(os.times()[:4])  # of this process and the programs it ran, whoever else is there
+    begin = sum(os.times()[:4])  # of this process and the programs it ran, whatever else runs
     rule = replace(crop_rule(task.kind, task.duration, task.interactive), turn_interest=TURN_INTEREST)
     recorded = max(RECORDED, 5 * task.duration)
     try:
@@ -235,7 +235,7 @@ def generate(
             for result in found:
                 before = len(writer)
                 for segment in result.segments:
-                    # A network under way when a run was killed is made anew: what is there of it is skipped.
+                    # A network under way when a run was killed is made again: what exists of it is skipped.
                     if len(writer) < plan.segments and not writer.has(segment.segment_id):
                         writer.append(segment, tags={"kind": result.task.kind, "network": result.task.name})
                 state.add(result, len(writer) == plan.segments)

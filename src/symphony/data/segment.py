@@ -191,17 +191,17 @@ class RunSegment:
     #: [J] int32 agents the source marks for prediction
     predict: Ints = field(default_factory=lambda: np.zeros(0, np.int32))
     file: str = ""  # name of the file it was read from, without folder
-    #: the recording it is part of. Segments of one recording share it, may overlap in time and are no
-    #: independent samples; empty if unknown, which stands for ``segment_id``. No part of the content hash.
+    #: the recording it is part of. Segments of one recording share it, may overlap in time and are not independent
+    #: samples; empty if unknown, which stands for ``segment_id``. Not part of the content hash.
     group: str = field(default="", metadata={"hashed": False})
-    #: links between lanes that conversion has added (see :mod:`symphony.data.joins`); a store keeps it as a
-    #: tag. No part of the content hash.
+    #: links between lanes that conversion has added (see :mod:`symphony.data.joins`); a store keeps it as a tag. Not
+    #: part of the content hash.
     joined_gaps: int = field(default=0, metadata={"hashed": False})
-    #: what is unusual, or was left out (see :mod:`symphony.data.odd`): kind -> example. A store keeps it as a
-    #: tag. No part of the content hash.
+    #: what is unusual, or was left out (see :mod:`symphony.data.odd`): kind -> example. A store keeps it as a tag.
+    #: Not part of the content hash.
     odd: Mapping[str, str] = field(default_factory=dict, metadata={"hashed": False})
-    #: steps of the log where the segment goes on past it (:mod:`symphony.rollouts.onward`); 0 where all are.
-    #: No part of the content hash, and never in a store.
+    #: steps of the log where the segment goes on past it (:mod:`symphony.rollouts.onward`); 0 where all are. Not part
+    #: of the content hash, and never in a store.
     logged: int = field(default=0, metadata={"hashed": False})
 
     @property

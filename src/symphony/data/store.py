@@ -23,7 +23,7 @@ from symphony.errors import DataError
 
 TWICE = "a segment of this name is in the store already"
 GROUP, NETWORK = "group", "network"
-"""Tags a segment's group is kept under: in this release, and by the generator before there were groups."""
+"""Tags under which a segment's group is kept: in this release, and by the generator before there were groups."""
 
 
 class SegmentStore(Sequence[RunSegment]):

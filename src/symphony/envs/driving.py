@@ -49,10 +49,10 @@ class State(NamedTuple):
     step: Tensor  # [*b] simulated steps since the first state
     stream: Tensor  # [*b] identity of the rollout
     state: Tensor  # [*b, N, 4] x, y, heading, speed
-    valid: Tensor  # [*b, N] who is there
+    valid: Tensor  # [*b, N] which agents are present
     goal: Tensor  # [*b, N] routes that agents follow, -1 for none
     progress: Tensor  # [*b, N] metres that they have come along them
-    waiting: Tensor | None = None  # [*b, N] who has not entered yet; None where traffic is not open
+    waiting: Tensor | None = None  # [*b, N] which have not entered yet; None where traffic is not open
 
 
 class DrivingEnv(EnvBase):
@@ -356,7 +356,7 @@ class DrivingEnv(EnvBase):
         gone = leaving(old[..., :2], new[..., :2], self.scenes.exits[row], self.scenes.hull[row])
         there = there & ~gone
         ready = waits & (at[:, None] >= self.scenes.enter[row])
-        # Most steps have nobody who could enter; only a device would wait to tell.
+        # In most steps no agent can enter; only a device would have to wait to know.
         if not on_host(ready) or bool(ready.any()):
             index = self.scenes.interactive[row]
             late = self.scenes.enter[row] > self.scenes.log_end[row, None] if self.past_log else None

@@ -22,8 +22,8 @@ from symphony.geometry.nearest import nearest, places
 OBJECT_FEATURES = 8 + AGENT_FEATURES
 CLEAR = 1.0  # metres that an agent which enters keeps from all others
 FORESEEN, LONGER = (0.5, 1.0), (1.5, 2.0)
-"""Seconds ahead at which its box would meet no other, were everyone to keep speed and course; of one that enters past
-the log these, too."""
+"""Seconds ahead at which an entering agent's box must meet no other if all keep speed and course, and more of them
+past the log."""
 HEADWAY = (0.25, 0.5, 0.75, 1.0)  # seconds for which that one could go on if all others stood
 _PLACES = 1 << 22  # positions times logged steps that are looked at together
 
@@ -111,7 +111,7 @@ def objects_at(
         height = height.scatter(1, index[..., None].expand(*index.shape, 2), own)
     x, y, heading, speed = state.unbind(-1)
     simulated = torch.stack([x, y, heading, speed * heading.cos(), speed * heading.sin()], -1)
-    # Those not there are written to a column past the last one, which is cut off again.
+    # Absent ones are written to a column past the last one, which is cut off again.
     column = torch.where(index_valid, index, agents)
     wide = column[..., None].expand(*index.shape, 5)
     logged = pad(logged, (0, 0, 0, 1)).scatter(1, wide, simulated)[:, :agents]
@@ -209,7 +209,7 @@ def observed_objects(
     # Places among all agents there are now, and among those of all scenes.
     now = chosen + torch.arange(0, objects.valid.numel(), agents, device=chosen.device)[:, None, None]
     row = chosen + (who.scene * agents)[:, None, None]
-    # Whoever is not seen may hold anything, and neither its numbers nor their gradient may get through.
+    # An agent that is not seen may hold anything, and neither its numbers nor their gradient may get through.
     state = objects.state.flatten(0, 1).index_select(0, now.flatten()).unflatten(0, now.shape)
     state = torch.where(mask[..., None], state, 0.0)
     seen = {"objects": _features(tables, who, state, row, mask), "objects_mask": mask}

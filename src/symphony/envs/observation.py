@@ -43,13 +43,13 @@ class ObservationConfig:
     speed_scale: float = 10.0  # m/s that become 1
     size_scale: float = 5.0  # metres of a box side that become 1
     route: bool = False  # whether it observes the route that is its goal
-    turns: bool = False  # whether whoever chooses a route observes where routes turn and change lanes
+    turns: bool = False  # whether the goal policy observes where routes turn and change lanes
     along: bool = False  # whether it observes where the objects are along that route
     gaps: bool = False  # whether it observes how far its box is from others
     #: whether it observes how far its box is from others and from the edge of the road
     clearance: bool = False
-    #: seconds ahead at which it also observes how far it would be from others, were everyone to keep speed
-    #: and course; with ``gaps`` or ``clearance`` only
+    #: seconds ahead at which it also observes how far it would be from others if all keep speed and course; with
+    #: ``gaps`` or ``clearance`` only
     foresight: tuple[float, ...] = ()
     own: bool = True  # whether it observes its own speed and size
 
@@ -230,8 +230,8 @@ def _features(
 ) -> Float[Tensor, "M N K F"]:
     """Return features of the points ``flat`` as agents see them."""
     config, index = tables.config, flat.flatten()
-    # A copy of the rows, which nobody else has yet: what depends on the agent is written over it. That takes half of
-    # the time of putting columns together.
+    # A copy of the rows, which nothing else uses yet: what depends on the agent is written over it. That takes half
+    # of the time of putting columns together.
     seen = tables.points.index_select(0, index).unflatten(0, flat.shape)
     x, y = seen[..., 0] - who.origin[..., :1], seen[..., 1] - who.origin[..., 1:]
     # Directions are kept apart, as a gradient may still ask for them.

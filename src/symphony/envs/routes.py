@@ -29,7 +29,7 @@ from symphony.streams import stream_of
 SPACING = 3.0  # metres between the points of a route; its last piece may be shorter
 POINTS = 64  # points of a route, from its beginning on, by which it is chosen: 189 m
 BEHIND, WINDOW = 12, 56
-"""Points of a route that are seen: so many behind the agent, so many in all (36 m behind to 129 m ahead)."""
+"""Points of a route that are seen: those behind the agent, and all of them (36 m behind to 129 m ahead)."""
 AHEAD = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20, 27)
 """Points of its route that a vehicle observes, counted from the one nearest to it."""
 ROUTE_FEATURES = 4 + 3 * (len(AHEAD) - 1)
@@ -41,11 +41,11 @@ TURN_FEATURES = 2 + (POINTS - 2)
 """Where a route begins, and a turn at each of its points but the first and the last."""
 ONWARD = 200.0  # metres that routes reach beyond what the fastest agent can drive
 _FASTER, _FASTEST = 1.1, 45.0
-"""What is driven may be faster than the fastest of the log by this factor, up to so many m/s."""
+"""Factor by which vehicles may be faster than the fastest of the log, and the m/s up to which they may."""
 _BACK, _SEARCHED = 4, 16
-"""Points before the last place along a route from which on the next one is looked for, and points looked at."""
+"""Points before the last place along a route from which on the next one is sought, and points searched."""
 _CUT, _SLACK = 1.5, 3.0
-"""Metres along a route to a metre driven (who cuts a corner gets on faster), and metres besides."""
+"""Metres along a route to a metre driven (cutting a corner is faster), and metres besides."""
 
 
 @dataclass(frozen=True)

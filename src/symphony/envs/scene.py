@@ -150,7 +150,7 @@ class SceneBatch(TensorClass):
     interactive: Tensor  # [N] int64 rows of A; 0 for padding
     interactive_valid: Tensor  # [N]
     enter: Tensor  # [N] int64 step at which the log brings an agent in; 0 for those there from the start
-    background: Tensor  # [N] agents that a rule drives, which nobody evaluates
+    background: Tensor  # [N] agents that a rule drives, which are not evaluated
     exits: Tensor  # [X, 4] where agents leave the map; zeros for padding
     hull: Tensor  # [H, 3] outline of the map
     last_step: Tensor  # [] int64, the segment's last step

@@ -30,11 +30,11 @@ from symphony.saved.rollouts import World
 
 STILL = 0.05  # speed in m/s up to which an agent that is hit has stopped, so that nothing is its fault (as in nuPlan)
 HORIZON = 5.0  # seconds ahead that a collision is looked for
-RED_SECONDS = 5.0  # for which an agent that ran a red light answers for whom it meets across
+RED_SECONDS = 5.0  # for which an agent that ran a red light is at fault for meeting others across
 CUT_IN_SECONDS = 4.0  # before a contact in which a lane change may have caused it
 RESPONSE, SPEED_UP, BRAKE_LEAST, BRAKE_MOST = 1.0, 3.5, 4.0, 8.0
-"""Of RSS: seconds until the one behind brakes, its acceleration until then, its braking then, and the braking of the
-one ahead, m/s^2 (defaults of Intel's ad-rss-lib)."""
+"""Parameters of RSS: seconds until the one behind brakes, its acceleration until then, its braking then, and the
+braking of the one ahead, m/s^2 (defaults of Intel's ad-rss-lib)."""
 CORNER = 0.5  # metres behind the front bumper that are its corner
 ENTERING = 0.1  # speed in m/s towards the other from which on an agent is on its way into a lane
 _TIE = 1e-3  # metres by which the normals of the other must part the boxes more than the own ones
@@ -51,7 +51,7 @@ class Contacts(NamedTuple):
     other: Indices  # row of A
     step: Indices  # the state after it, from 1
     share: Reals  # of the step before that state after which they first overlap, from 0 to 1
-    kind: Indices  # a CollisionKind, from the agent's point of view, whoever the other is
+    kind: Indices  # a CollisionKind, from the agent's point of view
     at_state: Bools  # whether they overlap at any state, not only between two
 
 
@@ -155,7 +155,7 @@ def at_fault(world: World, found: Contacts, lanes: Lanes, offroad: Bools, lights
     ends = np.isin(kind, [CollisionKind.INTO_LEADER, CollisionKind.REAR_ENDED])
     behind = kind == CollisionKind.INTO_LEADER
     rear, front = np.where(behind, me.row, it.row), np.where(behind, it.row, me.row)
-    # Who is on foot changes no lanes.
+    # Pedestrians change no lanes.
     driving = ends & (segment.agent_type[front] != AgentType.PEDESTRIAN)
     cut_in = np.zeros(len(kind), bool)
     cut_in[driving] = _cut_in(world, rear[driving], front[driving], found.step[driving], segment.dt)

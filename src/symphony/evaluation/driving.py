@@ -251,7 +251,7 @@ def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> tuple[Re
     log = saved.segment.position[rows, within, :2].astype(np.float64)
     seen = saved.logged(rows)
     goal = saved.goal[:, evaluated]
-    left = (~there & (there.cumsum(-1) > 0)).cumsum(-1) > 0  # who comes back is elsewhere, on purpose
+    left = (~there & (there.cumsum(-1) > 0)).cumsum(-1) > 0  # one that comes back is elsewhere, on purpose
     both = there & seen & ~left
     driven, compared = _length(path, there), _length(path, both)
     logged = np.broadcast_to(_length(log, seen), goal.shape).copy()
@@ -271,7 +271,7 @@ def progress(saved: SavedRollouts, evaluated: Indices, lanes: Lanes) -> tuple[Re
     stays = there[has][:, 1:] & there[has][:, :-1]
     driven[has], compared[has] = np.where(stays, np.diff(places, axis=1), 0.0).sum(1), _advance(places, both[has])
     logged[has] = _advance(stations_along(lines, log[who], seen[who]), seen[who])[which]
-    # Whoever is farther from the end than a vehicle is long has gone on from it.
+    # An agent that is farther from the end than a vehicle is long has gone on from it.
     past = np.linalg.norm(path[has] - lines[which][:, -1:], axis=-1) > PAST_END
     past &= places >= np.linalg.norm(np.diff(lines, axis=1), axis=-1).sum(-1)[which][:, None] - 1e-3
     beyond = np.zeros_like(has)

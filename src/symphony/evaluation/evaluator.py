@@ -35,9 +35,9 @@ from symphony.rollouts.workers import batches, naming, segments_together, settle
 from symphony.saved.rollouts import SavedRollouts, saved_rollouts
 
 BASELINES = ("playback", "constant_velocity")
-"""Evaluated beside every agent, on the agents it drives and for as long."""
+"""Baselines evaluated beside every agent, on the agents that it drives and for as long."""
 Observer = Callable[[int, SavedRollouts], None]
-"""Called with the number of each run segment in its dataset and the very rollouts that the metrics are of."""
+"""Called with the number of each run segment in its dataset and the rollouts that the metrics come from."""
 
 
 @dataclass
@@ -118,7 +118,7 @@ def evaluate(
         evaluation = Evaluation(one.name, RolloutMetrics(), how, acting, one.plan(how).kind)
         found.append(dataclasses.replace(evaluation, horizon=dataset.decisions * dataset.dt))
     for path in config.metric:
-        load_object(path)  # or complain before anything is simulated
+        load_object(path)  # fail before anything is simulated
     evaluator, done = _BatchEvaluator(everyone, found, dataset, observe is not None), 0
     tasks = batches(range(len(dataset)), size, config)
     with closing(shared(evaluator, tasks, config, dataset)) as results:
@@ -251,7 +251,7 @@ def _choices(scenes: SceneBatch, found: Simulation) -> list[Choice] | None:
     first = found.search.slots[..., 0, :each].sort(-1).values
     founders = 1 + (first.diff(dim=-1) != 0).sum(-1)
     turn = route_turns(*scenes.routes.beginnings())
-    # Goals of the background are nobody's choice.
+    # Goals of background agents are not chosen.
     goals = found.drawn.flatten(1, 2), found.goal
     drawn, goal = (torch.where(scenes.background[:, None], -1, each) for each in goals)
     return choices(drawn.cpu(), goal.cpu(), turn.cpu(), founders.float().mean(-1).cpu())

@@ -29,7 +29,7 @@ COLUMNS = {
 _ABOUT = ("segment", "rollout", "group", "failed", "progress_ratio", "beyond_route", "no_route")
 _RUN = (*_ABOUT, "collision", "at_fault_collision", "red_lights", "offroad_time")  # of each run, in a record
 _FREE = ("planner", "planner_seconds", "rollouts")
-"""Settings that are the planner's own, and how often it is tried."""
+"""Settings of the planner itself, and of how often it is tried."""
 _BESIDE_LOG = ("interactive", "others", "open_traffic", "radius", "duration", "seed")
 """Settings that mean something where all others play back their log."""
 

@@ -33,14 +33,14 @@ _USUAL = {
     for field in dataclasses.fields(EvaluateConfig)
     if field.name not in (*_NAMED, *_MEMORY, "duration", "seed", "metric")
 } | {"score": "discriminator", "goals": "tree"}
-"""What goes without saying in the name of an evaluation."""
+"""Settings that the name of an evaluation leaves out."""
 _PARTS: dict[str, tuple[str, ...]] = {
     "run": ("updates", "checkpoint", "named"),
     "data": ("name", "checksum"),
     "config": (*_NAMED, *_USUAL, "duration", "seed", "metric"),
     "cost": ("simulation",),
 } | dict.fromkeys(("playback", "constant_velocity", "curvature"), ())
-"""What a kept evaluation must have."""
+"""Entries that a kept evaluation must have."""
 
 
 def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> dict[str, Any]:

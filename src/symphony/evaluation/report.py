@@ -35,7 +35,7 @@ KIND_NAMES = {kind: kind.name.lower().replace("_", " ") for kind in CollisionKin
 _MOTION = ("max_acceleration", "max_braking", "max_jerk", "max_lateral_acceleration")
 _TIMES = ("offroad_time", "wrong_way_time", "blocking_time", "low_ttc_time")
 _WORST = ("at_fault_collision", "collision", "red_lights", *_TIMES)
-"""What makes a run that did not fail a bad one, worst first."""
+"""Events that make a run that did not fail a bad one, worst first."""
 _OTHERS = ("min_ttc", "progress", "progress_ratio", "beyond_route", "no_route", "log_distance", "first_event")
 NUMBERS = (*_WORST, *_MOTION, *_OTHERS, "collision_at_states", "collisions", "steps", "logged_steps")
 """Numbers of a run; None for one that is not defined."""
@@ -52,7 +52,7 @@ _MEANS: dict[str, tuple[str, float, str | None]] = {
     "log_distance": ("log_distance", 1.0, "logged_steps"),
     **{f"mean_{name}": (name, 1.0, None) for name in _MOTION},
 }
-"""Means over runs: of which number, times what, weighted by what."""
+"""Means over runs: the number, its factor and its weight."""
 
 
 @dataclass

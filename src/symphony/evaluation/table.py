@@ -22,12 +22,12 @@ SETTINGS: dict[Setting, tuple[int, int]] = {"main": (2, 10), "long": (2, 20), "m
 """Interactive agents and seconds."""
 WHOLE_LOG = 10  # seconds of a run that was trained on the whole of its segments
 METRICS = ("collision_rate", "offroad_time", "ade", "min_sade", "curvature_jsd")
-"""The paper's; collisions are those at states only, as the paper counts them."""
+"""The paper's metrics; collisions are those at states only, as the paper counts them."""
 _TRAFFIC = ("interactive", "others", "open_traffic", "radius")
 """Settings of an evaluation that decide what agents meet: rows of a table share them."""
 _PLACES = ("data", "validation.data", "out", "warm_start", "device", "wandb")
 _FREE = ("seed", "resume", "checkpoint_every", "log_every", *_PLACES)
-"""What may differ between runs of one method: which seed, where things lie."""
+"""Settings that may differ between runs of one method: the seed, and where things lie."""
 
 
 @dataclass(frozen=True)
@@ -157,9 +157,9 @@ COLUMNS = {
     "wosac_min_ade": Column("minADE", "m"),
     "cost": Column("CPU", "s/segment"),
 }
-"""By their keys in a record; metrics of a user's own, by import path, have none."""
+"""Columns by their keys in a record; a user's own metrics, by import path, have none."""
 WOSAC = tuple(key for key in COLUMNS if key.startswith("wosac"))
-"""Of evaluations with `--metrics wosac`; the metametric and the three means of its components are 0 to 1."""
+"""Columns of evaluations with `--metrics wosac`; the metametric and the three means of its components are 0 to 1."""
 DISTANCES = ("ade", "min_sade", "curvature_jsd", "curvature_jsd_floor")
 """Distances from the log, of which the log itself has none."""
 

@@ -120,7 +120,7 @@ class Cells(ABC):
         count, items = np.concatenate(counts), np.concatenate(parts)
         end = self._used + len(items)
         if end > len(self.items):
-            # Never shorter than what somebody may be reading.
+            # Never shorter than what another thread may be reading.
             self.items = np.concatenate([self.items, np.zeros(2 * end - len(self.items), np.int32)])
         self.items[self._used : end] = items
         self.count[number], self.sign[number] = count, self._signs(x, y, count, items, 0.5 * side)

@@ -36,7 +36,7 @@ SHARE = 0.125
 GRAPHS = 64
 """Lane graphs held in memory."""
 DISPLACED = 2.0
-"""Metres that a state to learn from may lie from the log, for which its place along the route is looked for."""
+"""Metres that a state to learn from may lie from the log, within which its place along the route is sought."""
 
 
 def evenly_spaced(total: int, count: int) -> list[int]:
@@ -401,7 +401,7 @@ def _seen_routes(
 ) -> RouteWindow:
     """Return the part that experts see of their routes, from states that may lie beside where they were."""
     taken = logged_routes([table for expert in experts for table in expert.routes], row)
-    # Whoever is displaced along the route by up to some metres has come as far as where it is now.
+    # An agent that is displaced along the route by some metres has come as far as where it is now.
     near = torch.full_like(progress, DISPLACED)[:, None]
     return taken.window(taken.progress(state[:, None, :2], progress[:, None], near))
 

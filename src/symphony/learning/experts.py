@@ -43,7 +43,7 @@ PACKAGE = Path(symphony.__file__).parent
 _TENSORS = ("agent", "states", "actions", "valid", "error", "progress")
 
 TOGETHER = 256
-"""Vehicles fitted at a time: more save no more calls worth saving, and their temporaries leave the cache."""
+"""Vehicles fitted at a time: more would save few calls, and their temporaries would leave the cache."""
 
 
 @dataclass(frozen=True)

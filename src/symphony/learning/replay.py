@@ -32,7 +32,7 @@ _LEARNED = (
     keys.WEIGHT,
 )
 COLLIDED, OFF_ROAD, MEMORY = 1.0, 0.5, 2.0
-"""What a collision costs, and a second off the road; seconds over which an action is to blame for it (1 / e)."""
+"""Costs of a collision and of a second off the road; seconds over which an action is to blame for it (1 / e)."""
 PRICE = 60.0
 """Weight of the policy gradient beside cloning."""
 

@@ -42,7 +42,7 @@ class CollisionKind(IntEnum):
 
 
 _RANK = (0, 1, 2, 3, 4, 7, 5, 6)
-"""Place of each kind when two happen at the same step: who was hit from behind comes last."""
+"""Place of each kind when two happen at the same step: being hit from behind comes last."""
 _TYPES = {2: CollisionKind.PEDESTRIAN, 3: CollisionKind.CYCLIST}
 """Agent types (see ``symphony.data.segment.AgentType``) that are kinds of their own."""
 

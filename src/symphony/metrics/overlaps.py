@@ -74,7 +74,7 @@ def meetings(
         row, who, other, step = near.nonzero(as_tuple=True)
         one = index[row, who]
         row = row + begin
-        # Who was not there before stays where it is now, and so does who meets it.
+        # An agent that was not there before stays where it is now, and so does one that meets it.
         both = seen[row, one, step] & seen[row, other, step]
         now = step if at_states else step + 1
         before = torch.where(both, step, now)

@@ -56,7 +56,7 @@ def road_features(distance: Float[Tensor, "*b points"]) -> Float[Tensor, "*b fea
 
 
 EncoderClass = Callable[..., Any]
-"""Called with the arguments of :class:`SceneEncoder`; gives a module that is called as that is, with its `width`."""
+"""Called with the arguments of :class:`SceneEncoder`; returns a module that is called like it, with a `width`."""
 
 
 class SceneEncoder(nn.Module):

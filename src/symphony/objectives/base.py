@@ -194,7 +194,7 @@ class ActorLoss(MaskedLoss):
             raise ValueError(
                 f"action {self.tensor_keys.action!r} has shape {tuple(action.shape)}, the actor's are {expected}"
             )
-        # A padded entry may hold anything, such as an index that is none.
+        # A padded entry may hold anything, such as an invalid index.
         fitted = counted.reshape(counted.shape + (1,) * (action.ndim - counted.ndim))
         action = torch.where(fitted, action, torch.zeros_like(action))
         cost = -dist.log_prob(action)

@@ -20,9 +20,8 @@ from symphony.objectives.base import MaskedLoss, Reduction
 
 Cost = Literal["log_d", "non_saturating", "logit"]
 COSTS = {"log_d": functional.logsigmoid, "non_saturating": functional.softplus, "logit": lambda score: score}
-"""Of a state with logit x, D = sigmoid(x) the probability that it is simulated: log D (the paper), whose gradient
-vanishes where D is sure of the log; -log(1 - D), whose gradient vanishes where D is fooled; x, whose never does.
-"""
+"""Costs of a state with logit x, D = sigmoid(x) the probability that it is simulated: log D (the paper), whose
+gradient vanishes where D is sure of the log; -log(1 - D), where it vanishes if D is fooled; x, where it never does."""
 
 
 class MGAILLoss(MaskedLoss):
@@ -142,7 +141,7 @@ class MGAILLoss(MaskedLoss):
         done = tensordict.get(self.tensor_keys.done, default=None)
         if done is None:
             raise KeyError(f"no end of the episode under {self.tensor_keys.done!r}")
-        # Numbers left behind by whoever drove from here before would decide every step anew.
+        # Numbers left behind by an earlier policy would decide every step again.
         now = tensordict.exclude(self.tensor_keys.plan, self.tensor_keys.noise)
         # Called with tensors alone, the batch was guessed from them.
         now.batch_size = done.shape[:-1]
@@ -150,7 +149,7 @@ class MGAILLoss(MaskedLoss):
         steps = self.horizon if plan is None else plan.shape[batch]
         if steps < 1:
             raise ValueError("nothing to simulate: give a horizon, or random numbers for at least one step")
-        self._mask(start)  # or complain now
+        self._mask(start)  # fail now if it is bad
         score, going = self._simulate(env, now, plan, steps)
         valid = self._counted(start, score.select(batch, 0).shape, done.device)
         counted = valid.unsqueeze(batch) & going
@@ -186,7 +185,7 @@ class MGAILLoss(MaskedLoss):
                 drawn = now.copy()
                 for key in env.action_keys:
                     drawn.set(key, acting.get(key))
-                # An environment may go on after an end, and a later state of it be none.
+                # An environment may go on after an end, and a later state of it be invalid.
                 alive = alive & ~now.get(self.tensor_keys.done)
                 now = env.step_mdp(env.step(drawn))
                 scored = functional_call(self.discriminator, frozen, (now.copy(),))

@@ -32,7 +32,7 @@ def auc(
     flat = scores.detach().flatten()
     above, below = (positive & valid).flatten(), (~positive & valid).flatten()
     positives, negatives = above.sum(), below.sum()
-    # What is no negative is sorted to the end; counts stop at the number of negatives. Nothing waits for a device.
+    # Non-negatives are sorted to the end; counts stop at the number of negatives. Nothing waits for a device.
     ordered = torch.where(below, flat, torch.inf).sort().values
     fewer = torch.searchsorted(ordered, flat.contiguous(), right=False).minimum(negatives)
     no_more = torch.searchsorted(ordered, flat.contiguous(), right=True).minimum(negatives)

@@ -13,7 +13,7 @@ from typing import Any
 from symphony.planners.interface import Planner, Traffic
 
 SECONDS = 60.0
-"""Seconds of the clock that a planner has for one answer, unless more or less are given."""
+"""Seconds of wall time that a planner has for one answer by default."""
 
 
 class _Overdue(BaseException):

@@ -229,7 +229,7 @@ class _Asked(_Driver):
         scene = start.get(keys.SCENE).flatten().tolist()
         state = start.get(keys.STATE)[..., place, :].reshape(-1, 4).cpu().numpy()
         own = fold_in(fold_in(start.get(keys.STREAM), Stream.PLANNERS), seed)
-        # Planners of one rollout draw apart; the ego's as where it is the only one.
+        # Planners of one rollout draw independently; the ego's as if it were the only one.
         own = fold_in(own, env.scenes.interactive[start.get(keys.SCENE), place]) if place else own
         stream = own.flatten().tolist()
         self._routes = [self._route(row) for row in range(len(egos.segments))]
@@ -281,7 +281,7 @@ class _Asked(_Driver):
             if going[m] and not isinstance(planner, Failure):
                 ahead = route_from(self._routes[row], come[m])
                 seen_at, past = self._past[numbers[m]]
-                past = past if seen_at == steps[m] - 1 else ()  # one that was gone begins anew
+                past = past if seen_at == steps[m] - 1 else ()  # one that was gone begins again
                 now = moves[m], present[m]
                 at = self.egos.segments[row], self.rows[row], steps[m], own[m].numpy()
                 seen = traffic_of(*at, now, past, ahead)

@@ -14,9 +14,9 @@ AMBER = (SignalState.CAUTION, SignalState.ARROW_CAUTION)
 BEFORE, BEYOND = 50.0, 10_000.0
 """Metres by which a route goes straight on before its start and past its end."""
 VIEW = 100.0
-"""Metres ahead within which the route's bends and limits, and others, are looked at."""
+"""Metres ahead within which the route's bends and limits, and other agents, count."""
 BACK = 5.0
-"""Metres of the route behind a place within which it is looked for."""
+"""Metres of the route behind a place within which it is sought."""
 AT_STOP, STOP_CHORD = 1.5, 15.0
 """Metres of a stop point from a route that it is on, and metres behind it for which the route follows its lane."""
 

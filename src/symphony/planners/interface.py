@@ -24,10 +24,10 @@ from symphony.imports import load_object
 
 Reals = NDArray[np.float64]
 Moment = tuple[Reals, NDArray[np.bool_]]
-"""Everyone at one step: x, y, heading and velocity [A, 5], and who is there [A]."""
+"""All agents at one step: x, y, heading and velocity [A, 5], and which are present [A]."""
 Moments = tuple[Moment, ...]
 Named = str | Callable[..., Any]
-"""A planner by its name, or what makes it."""
+"""A planner by its name, or a function that makes it."""
 Planners = Mapping[int | None, Named]
 """Planners by the ids of the agents that they drive, that of the ego, None, first."""
 
@@ -175,7 +175,7 @@ class Planner(Protocol):
 NAMES = {"idm": "symphony.planners.included:IDMPlanner", "log": "symphony.planners.included:LogPlanner"}
 """Planners with names of their own."""
 PIPE = "pipe:"
-"""Before the command of a planner in another process."""
+"""The prefix before the command of a planner in another process."""
 
 
 def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:

@@ -159,7 +159,7 @@ def _end(process: subprocess.Popen[bytes]) -> int:
         if process.stdin is not None:
             process.stdin.close()
     late = time.monotonic() + GRACE
-    # Left unreaped until its group is killed: as long as it is there, nobody else gets the number.
+    # Left unreaped until its group is killed: until then no other process gets its number.
     asked = os.WEXITED | os.WNOWAIT | os.WNOHANG
     with contextlib.suppress(ChildProcessError):
         while os.waitid(os.P_PID, process.pid, asked) is None and time.monotonic() < late:

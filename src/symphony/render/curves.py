@@ -45,7 +45,7 @@ LAST = ("updates_per_second", "learning_rate", "skipped_updates")
 DASHES: tuple[Any, ...] = ("-", (0, (3, 1.5)), (0, (1, 1)))
 LOG_COLOR, POLICY_COLOR = "#0072B2", "#E69F00"
 TITLE, LEAST_REACH = 40, 0.1
-"""Of a panel of curvature: characters of a line above, and 1/m that are shown to either side at least."""
+"""Sizes of a panel of curvature: characters of a line above, and the least 1/m shown to either side."""
 
 
 def plot_curves(

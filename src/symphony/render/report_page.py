@@ -26,7 +26,7 @@ TILES = {
     "mean_max_jerk": ("peak jerk", "m/s³"),
     "mean_max_lateral_acceleration": ("peak lateral acceleration", "m/s²"),
 }
-"""Numbers on top: their names and units."""
+"""Numbers at the top: their names and units."""
 COLUMNS = {
     "segment": "segment",
     "rollout": "rollout",
@@ -51,7 +51,7 @@ EVENTS = {
     "wrong_way_time": "wrong way",
     "blocking_time": "blocks traffic",
 }
-"""What is said of a run where a number is not 0."""
+"""Words for a run in which a number is not 0."""
 LEAD = 2.0  # seconds before the first event of a run at which its replay begins
 
 

@@ -127,7 +127,7 @@ def visited_regions(
         return np.zeros((*lead, shape[1]), dtype=bool)
     # From here on all trajectories are one list of valid states; later states have higher numbers.
     begins = np.concatenate(([True], row[1:] != row[:-1]))
-    # Rollouts that share a history, and whoever stands, come to a place many times: it is looked up once.
+    # Rollouts that share a history, and agents that stand, come to a place many times: it is looked up once.
     _, first, place = np.unique(points.view(np.complex128).ravel(), return_index=True, return_inverse=True)
     clear, region, starts = _states_on(graph, begins, points, headings, first, place)
     events = np.concatenate((starts, _passes(graph, row, points, headings, place)))

@@ -21,7 +21,7 @@ LIMIT = 200  # most routes a vehicle gets
 MAX_LANES = 500  # most lanes of a route
 
 CHANGE_METRES, CHANGE_SECONDS = 20.0, 3.0
-"""A change of lanes takes so many metres, or so many seconds at the vehicle's speed, whichever is longer."""
+"""Metres, or seconds at the vehicle's speed, that a change of lanes takes, whichever is longer."""
 CHANGE_TURN = np.radians(25.0)
 """Largest angle between two lanes where one changes, and what a change may turn more within 3 m than the lanes do."""
 CHANGE_WIDTH = 7.0  # metres between the centre lines of two lanes beside each other, at most
@@ -29,7 +29,7 @@ SAME = 1.0  # metres within which two routes are one
 _TIE = 1e-3
 _SLACK = 30.0  # metres of a route beyond 1.5 times the way driven that are compared with it
 _RETURN_METRES, _RETURN_WIDTH = 25.0, 6.0
-"""A line comes by a place twice where, so many metres farther along, it is within so many metres of it."""
+"""Metres farther along, and metres of distance, at which a line counts as passing a place twice."""
 
 
 class Route(NamedTuple):

@@ -71,7 +71,7 @@ class CarFollower(TensorDictModuleBase):
         row, at = tensordict.get(keys.SCENE).flatten(), tensordict.get(keys.STEP).flatten()
         state, valid = (tensordict.get(key).flatten(0, lead - 1) for key in (keys.STATE, keys.VALID))
         drives = scenes.background[row] & valid
-        m, n = places(drives)  # on a device all: whoever is not driven is moved, too, and put back
+        m, n = places(drives)  # on a device all: those not driven are moved, too, and put back
         everyone = self.env.objects(row, at, state, valid)
         agent = scenes.interactive[row[m], n]
         own, size = state[m, n], scenes.box_size[row[m], agent]

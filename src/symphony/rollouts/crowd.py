@@ -166,7 +166,7 @@ def crowd_dataset(
     in_open, onward = config.open_traffic or everyone or rule, None
     if isinstance(config, SimulateConfig):
         in_open = in_open or config.after_collision in ("remove", "respawn")
-        # Those that nobody would drive don't enter.
+        # Vehicles without a driver don't enter.
         inflow = config.inflow if rule or agent.policy is not None else 0.0
         onward = Onward(inflow, config.lights, config.seed) if config.duration and in_open else None
     crowd = Crowd(count, everyone, config.radius, in_open, rule, config.others == "idm", tuple(also), onward)

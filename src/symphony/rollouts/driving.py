@@ -40,7 +40,7 @@ from symphony.rollouts.unroll import (
 )
 
 RULES: dict[str, Any] = {"constant_velocity": constant_speed, "idm": CarFollower}
-"""Rules that can drive background agents in place of the agent, or everyone (an agent's ``rule``)."""
+"""Rules that can drive background agents in place of the agent, or all agents (an agent's ``rule``)."""
 FEW = 4  # branches of a tree beside a planner, at least
 
 
@@ -92,7 +92,7 @@ def simulation(
     """
     _check_given(agent, scenes, config, given)
     scenes, config = _ruled(agent, scenes, config, given) if agent.rule else (scenes, config)
-    # Beside log playback there are planners alone: a policy whose actions nobody looks at will do.
+    # Beside log playback there are only planners: any policy will do, as its actions are not used.
     policy = ConstantVelocity(Bicycle()) if agent.policy is None else agent.policy
     if agent.policy is None and int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > len(egos):
         raise ConfigError("beside log playback those with a planner are the only interactive agents")

@@ -119,7 +119,7 @@ def _planned(
         light[part] = number
     own = np.equal(light[:, None], turns)
     goes, slows = own & (within < green), own & (within >= green) & (within < green + amber)
-    # Who is amber while others are green comes to red first.
+    # A light that is amber while others are green turns red first.
     ends = np.array([amber - _since(row[None], np.ones(1, bool)) * dt for row in ambers])
     slows |= (ambers[:, -1] & ~now)[:, None] & (np.arange(steps) * dt < ends[:, None] - 1e-6)
     arrow = np.isin(state, ARROW).any(1, keepdims=True)

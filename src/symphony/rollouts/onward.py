@@ -29,7 +29,7 @@ Indices = NDArray[np.int64]
 NEAR, TURN = 50.0, math.pi / 3
 """Metres from where an entrance lane begins, and largest angle to it, within which a vehicle came in by it."""
 PRIOR = 10.0  # seconds of the log for which the mean rate of all entrances of a map counts at each of them
-USUAL = 8.0  # speed in m/s of who enters where nobody drives in the log, if the lane has no lower limit
+USUAL = 8.0  # speed in m/s of those that enter where none drives in the log, if the lane has no lower limit
 MOST_ENTER = 512  # vehicles that enter a run segment past its log, at most
 
 

@@ -35,7 +35,7 @@ from symphony.rollouts.unroll import draw_goals
 from symphony.streams import Stream, fold_in, uniform
 
 FILL, FEW = 4, 256
-"""Of lines that go back one in so many is simulated at a time, at least so many: the last steps are of few lines."""
+"""Of lines that go back one in FILL is simulated at a time, at least FEW: the last steps are of few lines."""
 AHEAD = 0.5
 """Seconds that :func:`rule_score` looks ahead."""
 COMPILER = {"backend": "inductor"}

@@ -25,7 +25,7 @@ from symphony.modules import drawn_goals
 from symphony.streams import Stream, fold_in, uniform
 
 _WORLD = 1 << 22
-"""Agents times states of scenes that are looked at together."""
+"""Agents times states of scenes that are processed together."""
 _NEVER = 1 << 30
 
 

@@ -26,7 +26,7 @@ POINTS = 1 << 19
 BYTES, FULL = 2048, 1024
 """Bytes of a card for each of these points, with all that is computed from it, and run segments that fill a card."""
 IN_TRAFFIC, NAMED = 32, 8
-"""Agents that a run segment is taken to have where everyone is driven; segments that an error names, at most."""
+"""Agents that a run segment is taken to have where all are driven; segments that an error names, at most."""
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -115,7 +115,7 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
                 now, before = manifest["settings"], _LATER | held["settings"]
                 changed.remove("settings")
                 changed += [f"settings.{n}" for n in {**now, **before} if now.get(n) != before.get(n)]
-            # One that holds nothing yet is nobody's.
+            # An empty folder belongs to no simulation.
             if changed and (_read_index(self.path) or any((self.path / SEGMENTS).glob("*"))):
                 message = f"holds the rollouts of another simulation, which differs in {', '.join(changed)}"
                 raise DataError(message, file=file, field=changed[0].partition(".")[0])

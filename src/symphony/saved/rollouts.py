@@ -19,7 +19,7 @@ from symphony import keys
 from symphony.data.levels import agent_heights
 from symphony.data.segment import Polylines, RunSegment
 
-if TYPE_CHECKING:  # who only reads rollouts waits for no torch
+if TYPE_CHECKING:  # reading rollouts alone needs no torch
     from torch import Tensor
 
     from symphony.collectors import BeamSearchResult
@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # who only reads rollouts waits for no torch
     from symphony.rollouts.unroll import Rollouts
 
 PLAYBACK = "playback"  # the driver of every agent of the log that is not named
-BACKGROUND = "background:"  # the begin of the names of drivers whose agents nobody evaluates
+BACKGROUND = "background:"  # the start of the names of drivers whose agents are not evaluated
 
 
 @dataclass(frozen=True)

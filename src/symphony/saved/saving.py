@@ -63,7 +63,7 @@ def save_simulation(
     config = beside_planner(config) if planner else config
     settings = plain_settings(config, agent, dataset.interactive, dataset.duration)
     settings |= {"goal": list(goals)} if goals else {}
-    settings |= planner_settings(planners, planner_seconds)  # complains before anything is simulated
+    settings |= planner_settings(planners, planner_seconds)  # fails before anything is simulated
     about = About.of(agent.name, dataset.store, settings, seed=config.seed, planner=planner_name(planner))
     with RolloutWriter(path, about) as writer:
         names = [dataset.store.ids[i] for i in dataset.indices]

@@ -97,10 +97,10 @@ class Validator:
         """
         with undisturbed(self.agent, self.device):
             found = evaluate(self.agent, self.dataset, self.how, progress).metrics.compute()
-        # Where no map has a boundary nobody can be off the road.
+        # Where no map has a boundary no agent can be off the road.
         off = found["offroad_time"] if found["offroad_segments"] else 0.0
         infractions = found["collision_rate"] + off
-        # Not a number, and so never the best, if nobody was simulated for a single step.
+        # Not a number, and so never the best, if no agent was simulated for a single step.
         if math.isfinite(infractions) and (self.best is None or infractions < self.best.infractions):
             self.best = Best(step, infractions)
         numbers = {f"validation_{name}": found[name] for name in METRICS}

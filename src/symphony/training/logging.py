@@ -18,7 +18,7 @@ from symphony.files import naming, write_file
 
 RECORDS = "metrics.jsonl"
 ID = "wandb-id"
-"""Beside it: the run's name at Weights & Biases."""
+"""The file beside the metrics with the run's name at Weights & Biases."""
 
 
 class Tracker:
@@ -44,7 +44,7 @@ class Tracker:
     ) -> None:
         self.path = folder / RECORDS
         self.kept = [r for r in read_metrics(folder) if r["step"] <= after] if after else []
-        # Put in place as a whole, lest a kill meanwhile lose what is kept.
+        # Put in place as a whole, so that a kill meanwhile cannot lose what is kept.
         write_file(self.path, "".join(json.dumps(record) + "\n" for record in self.kept))
         self._run = None
         mode = os.environ.get("WANDB_MODE", wandb)

@@ -68,13 +68,12 @@ FREE = (
     "log_every",
     "compile",
 )
-"""Settings that may be others when a run goes on, which is no other run for more updates or another machine."""
+"""Settings that may change when a run goes on: more updates or another machine do not make another run."""
 _SEED_STRIDE = 1_000_003
 
 Updates = Iterator[tuple[str, TensorDictBase]]
-"""Losses one by one, each with the name of the optimizer that descends it before the next is computed. What has no
-optimizer of its name is recorded only.
-"""
+"""Losses one by one, each with the name of the optimizer that descends it before the next is computed. Losses without
+an optimizer of their name are only recorded."""
 Rates = Callable[[int], Mapping[str, float]]
 """Learning rates by optimizer at an update."""
 
@@ -163,7 +162,7 @@ class Validation(Protocol):
 
 
 Preview = Callable[[int, Tracker], dict[str, float]]
-"""A hook that shows the agent as it is after an update, also to the tracker; gives numbers for the record."""
+"""A hook that shows the agent as it is after an update, also to the tracker; returns numbers for the record."""
 
 
 class Trainer:
@@ -240,7 +239,7 @@ class Trainer:
             TrainingError: if gradients stay infinite or undefined.
         """
         with contextlib.ExitStack() as held:
-            self.world.wait()  # no process writes before all have looked at what there is
+            self.world.wait()  # no process writes before all have read what exists
             if self.world.is_main:
                 self._lock = held.enter_context(Lock(self.config.out / LOCK))
                 if checkpoint_to_resume(self.config) != self.done:

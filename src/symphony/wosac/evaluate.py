@@ -171,8 +171,8 @@ def order_of(found: Sequence[PassingGaps]) -> OrderStatistics:
 
 
 WOSAC_BASELINES = (*BASELINES, "idm", "random")
-"""Scored beside every agent: log playback, constant velocity, the intelligent driver model along the lanes, and
-vehicles that act at random."""
+"""Baselines scored beside every agent: log playback, constant velocity, the intelligent driver model along the lanes,
+and vehicles that act at random."""
 
 
 class SegmentResult(NamedTuple):

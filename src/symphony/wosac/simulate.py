@@ -41,7 +41,7 @@ from symphony.wosac.scorer.config import CURRENT, DT, FUTURE, ROLLOUTS
 from symphony.wosac.scorer.scenario import STATES
 
 STILL = 0.2
-"""Metres that a vehicle that stands has moved in the last second, at most; at speeds up to twice that a second."""
+"""The most metres that a standing vehicle has moved in the last second; at speeds up to twice that a second."""
 AHEAD, ASIDE = 60.0, 3.0  # metres ahead and to a side within which a light is a vehicle's own
 PACE, COURSE = 0.4, 0.17
 """How much people's speeds (a share) and courses (radians, 10 degrees) differ between rollouts, either way."""

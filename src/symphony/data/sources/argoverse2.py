@@ -57,7 +57,7 @@ MAX_ROWS = 500_000  # states of a scenario; the dataset's have some thousand
 MAX_TEXT = 64  # characters of an id
 MAX_BYTES = 256 << 20  # bytes of the columns, decompressed
 TILE = 10.0
-"""Metres: maps are cut along the axes at whole multiples of it (30 in the files that were looked at)."""
+"""Metres: maps are cut along the axes at whole multiples of it (30 in the files examined)."""
 CUT_TOLERANCE = 0.011  # metres by which an edge may miss such a line: coordinates are kept to the centimetre
 
 _TEXTS = ("scenario_id", "focal_track_id", "track_id", "object_type")

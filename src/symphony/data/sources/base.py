@@ -27,7 +27,7 @@ NEAR = 50.0  # metres within which another agent counts as a neighbour of an ego
 MOVING = 2.0  # metres an agent must get away from where it is first seen to count as moving
 
 MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
-"""What plain code raises on data that are built otherwise than it expects."""
+"""The exceptions that plain code raises on data of an unexpected structure."""
 
 
 class UnexpectedError(DataError):

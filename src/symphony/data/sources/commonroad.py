@@ -56,7 +56,7 @@ _LANE_TYPES = (
 )
 _WALKWAYS = frozenset({"sidewalk", "crosswalk"})
 _BESIDE = frozenset({"shoulder", "border", "parking", "restricted"})
-"""Places of the road that are no way to anywhere."""
+"""Parts of the road that lead nowhere."""
 _SPEED_SIGNS = frozenset({"274", "R2-1", "r301", "R301"})
 _COLORS = dict.fromkeys(("red", "redYellow"), SignalState.STOP) | {
     "yellow": SignalState.CAUTION,

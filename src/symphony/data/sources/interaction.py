@@ -287,7 +287,7 @@ def find_files(path: Path) -> Files:
     if numbered is None:
         if split is None:
             raise DataError("expected a name like vehicle_tracks_000.csv or SCENE_train.csv", file=path)
-        # Its name says which map it needs: another place's would fit nowhere, and nobody would be told.
+        # Its name says which map it needs: another place's would not fit, and no error would say so.
         return Files(path, split[2], _map(path, split[1], alone=False), single=False)
     folder, part = path.parent, numbered[1]
     names = f"pedestrian_tracks_{part}.csv", "meta_data.csv", f"signal_phases_{part}.csv"

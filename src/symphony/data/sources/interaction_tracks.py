@@ -28,7 +28,7 @@ _TYPES = {
     "pedestrian/bicycle": AgentType.UNSET,
 }
 NOMINAL = {AgentType.PEDESTRIAN: (0.7, 0.7), AgentType.CYCLIST: (1.8, 0.7)}
-"""Length and width in metres of those whose box the format does not give."""
+"""Length and width in metres of agents whose box the format does not give."""
 CYCLING = 2.5  # m/s: of the type ``pedestrian/bicycle``, tracks whose fastest tenth is faster are cyclists
 MAX_GAP_MS = 1000  # longest time step that is taken for one
 SIGMA = 0.2  # seconds: of the Gaussian weights of the line whose slope is the velocity

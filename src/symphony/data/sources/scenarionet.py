@@ -350,7 +350,7 @@ def _points(value: Any) -> Doubles:
     """Return [P, 2 or 3] points in any notation; refuse what are no points, or not finite."""
     if isinstance(value, list | tuple):
         rows = [row.value.tolist() if isinstance(row, Array) else row for row in value]
-        # Looked at one by one: lists in lists may be larger than any memory.
+        # Checked one by one: lists in lists may be larger than any memory.
         fine = (len(row) in {2, 3} and all(isinstance(n, int | float) for n in row) for row in rows)
         refuse(not all(fine), "not a list of points")
         found = np.array(rows, np.float64)

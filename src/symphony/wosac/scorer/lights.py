@@ -15,7 +15,7 @@ from torch import Tensor
 
 from symphony.wosac.scorer.road import first_of_least
 
-RED = (1, 4)  # states of a red signal: arrow stop and stop; flashing ones are none
+RED = (1, 4)  # states of a red signal: arrow stop and stop; flashing ones are not red
 
 
 @dataclass(frozen=True)

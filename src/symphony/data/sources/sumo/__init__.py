@@ -62,7 +62,7 @@ def generate_run(
     seeds = np.random.SeedSequence([seed, _OWN if own else KINDS.index(kind)]).spawn(4)
     roads_rng, demand_rng, drive_rng, cut_rng = (np.random.default_rng(each) for each in seeds)
     with scratch() as folder:
-        # A freeway must be longer than the map: what its ends do to traffic is not for a segment to show.
+        # A freeway must be longer than the map: a segment must not show what its ends do to traffic.
         longer = max(0.0, rule.radius - RAMP_RADIUS) if ramp else 0.0
         if own:
             file = own_network(Path(kind), folder)

@@ -32,7 +32,7 @@ BEND = 2.0  # metres between the points of a lane at which it may bend
 RAMP_RADIUS = 190.0
 """Radius in metres of the largest map that fits between the ends of a freeway and of its ramps."""
 OWN_ROADS = {".xodr": "--opendrive-files", ".osm": "--osm-files", ".net.xml": "--sumo-net-file"}
-"""Endings of road networks of one's own (OpenDRIVE, OpenStreetMap, SUMO), and how ``netconvert`` is told of them."""
+"""Suffixes of users' own road networks (OpenDRIVE, OpenStreetMap, SUMO), and ``netconvert``'s options for them."""
 
 Random = np.random.Generator
 Pairs = list[tuple[int, int]]
