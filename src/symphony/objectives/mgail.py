@@ -21,7 +21,7 @@ from symphony.objectives.base import MaskedLoss, Reduction
 Cost = Literal["log_d", "non_saturating", "logit"]
 COSTS = {"log_d": functional.logsigmoid, "non_saturating": functional.softplus, "logit": lambda score: score}
 """Costs of a state with logit x, D = sigmoid(x) the probability that it is simulated: log D (the paper), whose
-gradient vanishes where D is sure of the log; -log(1 - D), where it vanishes if D is fooled; x, where it never does."""
+gradient vanishes where D is sure of the log; -log(1 - D), where D is fooled; x, nowhere."""
 
 
 class MGAILLoss(MaskedLoss):
