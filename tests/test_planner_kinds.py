@@ -396,7 +396,7 @@ def test_planners_of_others_fail_by_their_name_and_what_can_not_be_is_told(store
     for given, status, why in (
         ("3=idm", 1, "the ego has one planner, there is none"),
         ("idm log", 1, "2 are named: idm, log"),
-        (f"idm {agent}=log {agent}=idm", 1, f"agent {agent} has another one"),
+        (f"idm {agent}=log {agent}=idm", 1, f"agent {agent} already has another one"),
         (f"idm {agent}=no.py:plan", 1, "no such file"),
         (f"idm {agent}=log --goal {agent}=1,2", 1, f"a planner drives agent {agent}"),
         ("idm 99=log", 3, "99: not all are ids of vehicles beside the ego"),

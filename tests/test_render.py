@@ -476,7 +476,7 @@ def test_the_command_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["plot", "curves", one, two, "--out", out, "--metrics", "auc", "accuracy"]) == 0
     assert Path(out).stat().st_size > 5_000
     for words, expected in (
-        ([one, fresh], f"{fresh}: is no run"), ([str(tmp_path)], f"{tmp_path}: is no run"),
+        ([one, fresh], f"{fresh}: is not a run"), ([str(tmp_path)], f"{tmp_path}: is not a run"),
         ([one, "--metrics", "auk"], "no run has auk"), ([one, "--out", "a.txt"], ".png"),
     ):  # fmt: skip
         assert main(["plot", "curves", "--out", out, *words]) == 1

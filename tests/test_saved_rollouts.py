@@ -98,7 +98,7 @@ def test_an_interrupted_folder_is_continued(tmp_path):
     assert (sorted(again.ids), again.failures) == (sorted(whole.ids), [])
     for name in whole.ids:
         assert_same(whole.of(name), again.of(name))
-    with pytest.raises(DataError, match="there already"):
+    with pytest.raises(DataError, match="exist already"):
         RolloutWriter(tmp_path / "cut", ABOUT).add(found[0])
 
 

@@ -199,7 +199,7 @@ def test_names_of_checkpoints(tmp_path: Path) -> None:
     assert [choose(run, w).name[-1] for w in ("", "best", "last", "2", "step-6")] == ["4", "4", "6", "2", "6"]
     with pytest.raises(ConfigError, match="no checkpoint of step 3, it has those of the steps 2, 4, 6"):
         choose(run, "3")
-    with pytest.raises(ConfigError, match="'first' is no checkpoint; name best, last or a step"):
+    with pytest.raises(ConfigError, match="'first' is not a checkpoint; name best, last or a step"):
         choose(run, "first")
     shutil.rmtree(choose(run))
     with pytest.raises(CheckpointError, match="best checkpoint, of step 4, is gone; it has"):

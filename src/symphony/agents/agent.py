@@ -322,5 +322,5 @@ def read_spec(folder: Path) -> AgentSpec:
     path = folder / FILE
     if not path.is_file():
         known = f"'{PLAYBACK}', 'constant_velocity', 'idm', 'random', '{PREFIX}NAME'"
-        raise ConfigError(f"{folder} is no agent: expected {known} or the folder of a run (one with an {FILE})")
+        raise ConfigError(f"{folder} is not an agent: expected {known} or the folder of a run (one with an {FILE})")
     return read_json(AgentSpec, path)

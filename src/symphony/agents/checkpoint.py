@@ -102,8 +102,8 @@ def load_checkpoint(
     Modules and optimizers go by the names they were saved under; ``partial`` lets the checkpoint hold more than is
     asked for. With ``restore_rng`` the global random states of Python, numpy and torch are set, too.
 
-    Raises a :class:`CheckpointError` if the folder is no complete checkpoint of this format, a checksum fails, names,
-    shapes or types differ, or a weight is not finite; names the file and the field.
+    Raises a :class:`CheckpointError` if the folder is not a complete checkpoint of this format, a checksum fails,
+    names, shapes or types differ, or a weight is not finite; names the file and the field.
     """
     manifest, file = _read_manifest(path), path / MANIFEST
     asked: dict[str, Any] = {f"module.{name}": item for name, item in (modules or {}).items()}

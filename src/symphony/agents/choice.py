@@ -80,7 +80,7 @@ def choose(folder: Path, which: str = "") -> Path:
             raise ConfigError(f"{folder}: no checkpoint of step {int(named[1])}, {held}")
         return found[int(named[1])]
     if which not in ("", "best", "last"):
-        raise ConfigError(f"{folder}: '{which}' is no checkpoint; name best, last or a step, {held}")
+        raise ConfigError(f"{folder}: '{which}' is not a checkpoint; name best, last or a step, {held}")
     best = None if which == "last" else best_of(found[last])
     if best is None and which == "best":
         raise ConfigError(f"{folder}: the run was not validated, so that none is the best; {held}")

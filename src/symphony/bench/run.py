@@ -294,4 +294,4 @@ def _earlier(suite: Suite) -> dict[tuple[str, str], list[Run]]:
             raise DataError("is of other run segments", file=suite.baseline, field="store")
         return {(one["planner"], one["crowd"]): list(one["per_run"]) for one in found["pairs"]}
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"is no result of a suite: {error!r}", file=suite.baseline) from error
+        raise DataError(f"is not the result of a suite: {error!r}", file=suite.baseline) from error

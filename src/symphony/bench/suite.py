@@ -158,7 +158,7 @@ def read_suite(path: Path, **shared: Any) -> Suite:
     if baseline and baseline not in names["planners"]:
         baseline = Path(file.beside(str(baseline)))
         if not baseline.is_file():
-            raise top.wrong("baseline", "is no planner of the suite and no file")
+            raise top.wrong("baseline", "is neither a planner of the suite nor a file")
     groups = len({str(store.groups[i]) for i in items})
     limits = tuple(_threshold(one, names, sure, groups, bool(baseline)) for one in tables["threshold"])
     name = top.given.get("name", path.stem)
@@ -203,7 +203,7 @@ class _Table:
     def __init__(self, file: _File, name: str, k: int | None, given: Any) -> None:
         self.file, self.name, self.k, self.given = file, name, k, given
         if not isinstance(given, dict):
-            raise self.wrong("", "is no table")
+            raise self.wrong("", "is not a table")
         keys = _KEYS[name]
         for key, value in given.items():
             if key not in keys:
@@ -228,7 +228,7 @@ class _Table:
     def named(self) -> str:
         name = str(self.given.get("name", self.given[_NEEDED[self.name]].removeprefix("pretrained:")))
         if not NAME.fullmatch(name):
-            raise self.wrong("name", f"{name!r} is no name: give one of letters, digits and _.+-")
+            raise self.wrong("name", f"{name!r} is not a valid name: use letters, digits and _.+-")
         return name
 
     def check_confidence(self, value: Any) -> None:

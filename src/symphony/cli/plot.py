@@ -63,7 +63,7 @@ class Curves(shared.Command):
 
         found = {str(folder): read_metrics(folder) for folder in self.runs}
         if empty := [folder for folder, records in found.items() if not records]:
-            raise errors.DataError("is no run: it holds no metrics.jsonl with records", file=empty[0])
+            raise errors.DataError("is not a run: it holds no metrics.jsonl with records", file=empty[0])
         render.plot_curves(found, self.out, metrics=self.metrics, window=self.window)
 
 

@@ -307,7 +307,7 @@ def _step(
     """Return a step's kept entries, next state, scores, and which episodes ended; one program if compiled."""
     stepped = env.step(policy(now))
     now = env.step_mdp(stepped)
-    seen = now.copy()  # the reward is shown to the score, but is no part of the next step's input
+    seen = now.copy()  # the reward is shown to the score, but is not part of the next step's input
     for key in env.reward_keys:
         seen.set(key, stepped.get(below(key)))
     values = score(seen)

@@ -283,14 +283,14 @@ class Job:
             if old != new:
                 raise ConfigError(
                     f"{name} is {new}, but the conversion that was interrupted had {old}: give the same "
-                    f"arguments to go on with it, or delete {folder} to begin anew"
+                    f"arguments to continue it, or delete {folder} to begin again"
                 )
         others = set(begun.changed.items()) ^ set(self.changed.items())
         if others or begun.files != self.files:
             first = min(others)[0] if others else "in another order"
             raise ConfigError(
-                f"the files are others, or were changed, since the conversion was interrupted ({first}): "
-                f"delete {folder} to begin anew"
+                f"the files are others, or have changed, since the conversion was interrupted ({first}): "
+                f"delete {folder} to begin again"
             )
 
 

@@ -41,7 +41,7 @@ def read_npz(path: Path, names: Collection[str] = (), *, most: int = MOST) -> di
         except DataError:
             raise
         except Exception as error:  # each way of packing has its own
-            message = f"expected an .npz archive of arrays; it is none, or damaged: {error}"
+            message = f"expected an .npz archive of arrays; it is something else or damaged: {error}"
             raise DataError(message, file=path, field=name) from None
     return found
 

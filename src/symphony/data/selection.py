@@ -53,7 +53,7 @@ class Relations(NamedTuple):
 
 
 def relations(segment: RunSegment, others: Rows) -> Relations:
-    """Relate vehicles [K] to the ego, which is none of them, by the paths that were logged."""
+    """Relate vehicles [K] to the ego, which is not one of them, by the paths that were logged."""
     merge, crossing = np.full(len(others), np.inf), np.full(len(others), np.inf)
     leader, follower = _queue_gap(segment, others, -1), _queue_gap(segment, others, 1)
     rows = np.flatnonzero(_boxes_meet(segment, others))

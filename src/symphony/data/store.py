@@ -31,7 +31,7 @@ class SegmentStore(Sequence[RunSegment]):
 
     Holds what was complete when it was opened. Pickles as its path, so each process maps the files itself. The first
     time a process reads a segment, its content and its map's are compared with the hash that was written with it,
-    and checked against the schema. A :class:`DataError` says if it is no store, of another version, or a file is
+    and checked against the schema. A :class:`DataError` says if it is not a store, of another version, or a file is
     missing, truncated or damaged.
     """
 

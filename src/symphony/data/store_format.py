@@ -153,7 +153,7 @@ def check_header(folder: Path) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Parse a JSON object; a :class:`DataError` if it can't be read, or is none."""
+    """Parse a JSON object; a :class:`DataError` if it can't be read, or is not one."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:

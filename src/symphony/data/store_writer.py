@@ -69,7 +69,7 @@ class StoreWriter(AbstractContextManager["StoreWriter"]):
         """
         segment = _plain(validate(segment))
         if tags and GROUP in tags:
-            raise DataError(f"{GROUP!r} is no name for a tag", segment=segment.segment_id, field="tags")
+            raise DataError(f"{GROUP!r} cannot name a tag", segment=segment.segment_id, field="tags")
         # Not a column of its own: older stores and releases have none.
         known = segment.group not in {"", segment.segment_id}
         noted = {**(tags or {}), **({GROUP: segment.group} if known else {})}

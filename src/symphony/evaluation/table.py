@@ -57,7 +57,7 @@ class Entry:
     def number(self, key: str, where: Mapping[str, Any] | None = None) -> float:
         """Return a number of the record, or of a part of it; NaN for a mean over nothing.
 
-        Raises a :class:`DataError` where it is no number.
+        Raises a :class:`DataError` where it is not a number.
         """
         where = self.record if where is None else where
         if key == "cost":
@@ -67,7 +67,7 @@ class Entry:
         if value is None:  # JSON has no NaN
             return math.nan
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise DataError("is no number", file=str(self), field=key)
+            raise DataError("is not a number", file=str(self), field=key)
         return float(value)
 
     def baseline(self, name: str, key: str) -> float:

@@ -100,7 +100,7 @@ class ItemCache(Generic[T]):
             if not self._warned:
                 self._warned = True
                 much = f"{self.limit / 2**30:.2g} GiB of memory: {len(self.kept)} are kept"
-                why = f"{self.name} take more than {much}, others are prepared anew each time they are drawn"
+                why = f"{self.name} take more than {much}, others are prepared again each time they are drawn"
                 warnings.warn(why, DataWarning, stacklevel=2)
             self._held -= self.kept.popitem(last=False)[1][1]
         return found

@@ -53,7 +53,7 @@ class CollisionKinds(NamedTuple):
     kind: Int[Tensor, "*lead N"]  # int64 :class:`CollisionKind`, -1 for no collision
     step: Int[Tensor, "*lead N"]  # int64 simulated step, from 0, -1 for no collision
     other: Int[Tensor, "*lead N"]  # int64 row of A of the agent it collided with, -1 for no collision
-    playback: Bool[Tensor, "*lead N"]  # bool, whether that one is no interactive agent
+    playback: Bool[Tensor, "*lead N"]  # bool, whether that one is not an interactive agent
 
     def first(self) -> tuple[Int[Tensor, "*lead"], Bool[Tensor, "*lead"]]:
         """Return the kind (-1 for none) and `playback` of the first collision of each rollout.

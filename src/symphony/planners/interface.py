@@ -236,10 +236,10 @@ def named_planners(words: Sequence[str]) -> tuple[str, dict[int, str]]:
         if not agent.removeprefix("-").isdecimal():
             egos.append(word)
         elif others.setdefault(int(agent), name) != name or not name:
-            raise ConfigError(f"planner '{word}': agent {agent} has another one")
+            raise ConfigError(f"planner '{word}': agent {agent} already has another one")
     if len(egos) > 1 or (others and not egos):
         told = f"{len(egos)} are named: {', '.join(egos)}" if egos else "there is none (`log` plays back its log)"
-        raise ConfigError(f"the ego has one planner, {told}; another agent's is such as 3=idm, by its id")
+        raise ConfigError(f"the ego has one planner, {told}; name another agent's by its id, as in 3=idm")
     return "".join(egos), others
 
 

@@ -58,7 +58,7 @@ def given_goals(
             if place[0] < planned:
                 raise ConfigError(f"goal '{goal}': a planner drives agent {agent}")
             if int(found[b, place[0]]) >= 0:
-                raise ConfigError(f"goal '{goal}': agent {agent} has been given another one")
+                raise ConfigError(f"goal '{goal}': agent {agent} already has another goal")
             away = _distances(scenes, b, place[0], shapely.points(_place(goal, where, segment)))
             if (nearest := min(away, default=np.inf)) > REACH:
                 near = f", the nearest stays {nearest:.1f} m away" if away else ""

@@ -139,7 +139,7 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
         """Write the rollouts of one segment; a DataError if they break the format or are there already."""
         name = saved.segment.segment_id
         if self.has(name):
-            raise DataError("the rollouts of this segment are there already", file=self.path, segment=name)
+            raise DataError("the rollouts of this segment exist already", file=self.path, segment=name)
         arrays, facts = tensors_of(saved)
         data = save(arrays, {KEY: json.dumps(facts, ensure_ascii=False)})
         file = f"{SEGMENTS}/{file_stem(name)}.safetensors"
@@ -306,7 +306,7 @@ def read_tensors(data: bytes, file: Path, segment_id: str) -> SavedRollouts:
 
 def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedRollouts:
     if "log_weight" in arrays:
-        raise DataError("is of a search with a tilt, which is no more: simulate anew", field="log_weight")
+        raise DataError("is of a search with a tilt, which was removed: simulate again", field="log_weight")
     kinds = {**_SCALARS, "start": int, "drivers": list, "failed": dict, "logged": int}
     facts.setdefault("logged", 0)
     for name, kind in (kinds | {"prune_every": int} if "prune_every" in facts else kinds).items():

@@ -116,7 +116,7 @@ def _drive(
 
 def has_ego(writer: RolloutWriter, dataset: SceneDataset, item: int, rollouts: int) -> bool:
     """Return whether the first interactive agent of an item is the ego; otherwise record it as failed."""
-    segment, why = dataset.segment(item), "the ego is no vehicle that is seen at the first step"
+    segment, why = dataset.segment(item), "the ego is not a vehicle that is seen at the first step"
     try:
         if int(dataset.scene(item).interactive[0, 0]) == segment.ego:
             return True

@@ -71,7 +71,7 @@ def meta_problems(message: pb.SimAgentsChallengeSubmission) -> Iterator[tuple[st
     if message.submission_type != SIM_AGENTS:
         yield "submission_type", f"is {message.submission_type}, expected {SIM_AGENTS} (sim agents)"
     if "@" not in message.account_name:
-        yield "account_name", f"{message.account_name!r} is no e-mail address"
+        yield "account_name", f"{message.account_name!r} is not an e-mail address"
     if not message.unique_method_name.strip():
         yield "unique_method_name", "missing"
     for field in ("uses_lidar_data", "uses_camera_data", "uses_public_model_pretraining"):
@@ -80,7 +80,7 @@ def meta_problems(message: pb.SimAgentsChallengeSubmission) -> Iterator[tuple[st
     if message.uses_public_model_pretraining and not message.public_model_names:
         yield "public_model_names", "missing, though public models were used"
     if not _PARAMETERS.fullmatch(message.num_model_parameters):
-        problem = f"{message.num_model_parameters!r} is no number with a suffix, such as 200K"
+        problem = f"{message.num_model_parameters!r} is not a number with a suffix, such as 200K"
         yield "num_model_parameters", problem
     if not message.acknowledge_complies_with_closed_loop_requirement:
         yield "acknowledge_complies_with_closed_loop_requirement", "not acknowledged"
@@ -287,7 +287,7 @@ def _check_scenario(scenario: pb.ScenarioRollouts, seen: set[str], required: Map
     if name in seen:
         raise DataError("more than once in the submission", field="scenario_id")
     if required is not None and name not in required:
-        raise DataError("none of the scenarios to simulate", field="scenario_id")
+        raise DataError("not one of the scenarios to simulate", field="scenario_id")
     scenes = scenario.joint_scenes
     if len(scenes) != ROLLOUTS:
         raise DataError(f"{len(scenes)} rollouts, expected {ROLLOUTS}", field="joint_scenes")

@@ -110,7 +110,7 @@ def map_path(path: Path) -> Path:
 def read_columns(data: bytes) -> Columns:
     """Return the columns the reader needs, as arrays [N].
 
-    A :class:`DataError` says if the file is no Parquet or too large, or a column is missing, of another type, or has
+    A :class:`DataError` says if the file is not Parquet or too large, or a column is missing, of another type, or has
     gaps.
     """
     import pyarrow as pa  # noqa: PLC0415 - an optional extra
@@ -188,7 +188,7 @@ def _segment(columns: Columns, name: str, path: Path) -> RunSegment:
         refuse(len(mixed), f"track {mixed[:1]} has more than one", field)
     step, count = columns["timestep"], _constant(columns, "num_timestamps")
     refuse(not 2 <= count <= MAX_STEPS, f"{count} steps, expected 2 … {MAX_STEPS}", "num_timestamps")
-    refuse(step.min() < 0 or step.max() >= count, f"a step that is none of the {count}", "timestep")
+    refuse(step.min() < 0 or step.max() >= count, f"a step that is not one of the {count}", "timestep")
     steps = int(step.max()) + 1
     schema.check_counts(len(names), steps, "track_id")
     states, counts = np.unique(row * steps + step, return_counts=True)
@@ -335,7 +335,7 @@ def _is_cut(ring: Doubles) -> Bools:
 
 
 def _id(value: Any) -> int:
-    refuse(type(value) is not int, f"{str(value)[:40]!r} is no id")
+    refuse(type(value) is not int, f"{str(value)[:40]!r} is not an id")
     return int(np.int64(value))  # raises where it has more than 64 bits
 
 

@@ -53,7 +53,7 @@ class Reader(ABC):
         try:
             refuse(path.is_dir(), "is a folder, expected a file", file=path)
             # A pipe may never end.
-            refuse(path.exists() and not path.is_file(), "is no ordinary file", file=path)
+            refuse(path.exists() and not path.is_file(), "is not an ordinary file", file=path)
             items = iter(self._read(path))
             while True:
                 # Absurd numbers may overflow on the way: the result is not finite, which validation reports.

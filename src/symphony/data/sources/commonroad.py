@@ -190,7 +190,7 @@ def _obstacle(node: ET.Element, moves: bool) -> tuple[int, int, Doubles, Box]:
     log = np.array([_state(state, name, moves) for state in states], np.float64)
     if moves:
         predicted = node.find("occupancySet") is not None
-        refuse(predicted, "predicted occupancies are no logged motion", f"{name}: occupancySet")
+        refuse(predicted, "predicted occupancies are not logged motion", f"{name}: occupancySet")
         steps, counts = np.unique(log[:, 0], return_counts=True)
         refuse((counts > 1).any(), f"two states at step {steps[counts > 1][:1]}", f"{name}: time")
     else:  # at rest whatever its file says

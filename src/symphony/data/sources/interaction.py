@@ -149,7 +149,7 @@ class InteractionReader(Reader):
                 yield start, stop
 
     def _window(self, rows: Rows, scene: _Scene, name: str, begin: int, steps: int) -> Iterator[RunSegment]:
-        refuse(not len(rows), "nobody is there", "track_id")
+        refuse(not len(rows), "no agent is present", "track_id")
         ids, first, row = np.unique(rows.track, return_index=True, return_inverse=True)
         check_counts(len(ids), steps, "track_id")
         kind = rows.kind[first]
@@ -363,7 +363,7 @@ def _read_phases(path: Path) -> dict[int, tuple[NDArray[np.int64], NDArray[np.ui
         entries: dict[int, dict[int, int]] = {}
         for k, row in enumerate(rows, start=2):
             if len(row) != len(_PHASE_COLUMNS) or row[2] not in _PHASES:
-                raise DataError(f"{','.join(row)[:60]!r} is no phase", field=f"line {k}")
+                raise DataError(f"{','.join(row)[:60]!r} is not a phase", field=f"line {k}")
             group, time = (base.integer(entry, f"line {k}") for entry in row[:2])
             state = _PHASES[row[2]]
             if entries.setdefault(group, {}).setdefault(time, state) != state:

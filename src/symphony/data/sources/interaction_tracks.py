@@ -175,7 +175,7 @@ def stepped(rows: Rows) -> tuple[Rows, float, float]:
     number = np.rint((times - times[0]) / step).astype(np.int64)
     off = np.abs(times - times[0] - number * step) > EVEN * step + 1
     wrong = not usual <= MAX_GAP_MS or off.any() or (np.diff(number) < 1).any()
-    refuse(wrong, f"times are no multiples of their usual step of {usual:g} ms", "timestamp_ms")
+    refuse(wrong, f"times are not multiples of their usual step of {usual:g} ms", "timestamp_ms")
     return replace(rows, time=number[which]), step / 1000, float(times[0])
 
 

@@ -121,7 +121,7 @@ class LaneletMap:
 def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
     """Read an ``.osm`` or ``.osm_xy`` file; ``projection``, such as ``partial(utm, origin=...)``, is for degrees.
 
-    A :class:`DataError` names file and element where it is no OSM XML, declares a document type, a node, way or rule
+    A :class:`DataError` names file and element where it is not OSM XML, declares a document type, a node, way or rule
     can't be read, or it has no lanelets with both bounds.
     """
     with located(file=path):
