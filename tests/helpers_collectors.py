@@ -102,7 +102,7 @@ def starts(env: Walk, *rows: int, branches: int, seed: int = 0) -> TensorDictBas
 
 
 def assert_same(first: TensorDictBase, second: TensorDictBase) -> None:
-    """The same entries with the same values, to the last bit."""
+    """Check for the same entries with the same values, to the last bit."""
     assert set(first.keys(True, True)) == set(second.keys(True, True))
     for key in first.keys(True, True):
         one, other = first.get(key), second.get(key)
@@ -112,7 +112,7 @@ def assert_same(first: TensorDictBase, second: TensorDictBase) -> None:
 class Mass(EnvBase):
     """Points x' = x + 0.5 (v + action), whose episode is over beyond a limit; they can come back in, if not sticky.
 
-    There is one point, or so many agents, which end apart.
+    There is one point, or several agents, which end separately.
     """
 
     batch_locked = False

@@ -45,7 +45,7 @@ class PretendDevice:
         self.constants = 0
 
     def constant(self, *given: Any) -> Tensor:
-        """One that the package makes; to be kept by whoever calls this."""
+        """Return a constant that the package makes; the caller must keep it."""
         self.constants, waits = self.constants + 1, len(self.waits)
         made = _MADE(*given)
         del self.waits[waits:]
@@ -53,7 +53,7 @@ class PretendDevice:
 
 
 def _tensors(value: Any) -> list[Tensor]:
-    """Those in what an operator takes or returns, which nests lists only."""
+    """Return the tensors in what an operator takes or returns, which nests lists only."""
     if isinstance(value, Tensor):
         return [value]
     return [found for part in value for found in _tensors(part)] if isinstance(value, list | tuple) else []
@@ -77,7 +77,7 @@ class _Watch(TorchDispatchMode):
 
 
 class _Backend(registration._DummyBackendModule):
-    """What PyTorch and TensorDict take for the device's module, such as ``torch.cuda``."""
+    """The module that PyTorch and TensorDict take for the device's, such as ``torch.cuda``."""
 
     pretended: PretendDevice | None = None
 

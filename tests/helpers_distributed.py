@@ -34,7 +34,7 @@ CPU = torch.device("cpu")
 
 
 def config(method: Any, store: Path, out: Path) -> TrainConfig:
-    """Of a run with all that is random, and as much of MGAIL as there is."""
+    """Return the configuration of a run with all that is random, and as much of MGAIL as there is."""
     validation = ValidationConfig(data=store, segments=1, rollouts=1)
     mgail = MGAILConfig(regression=2, head_start=1, rollouts=2, expert_weight=0.5)
     return tiny(method, store, out, validation=validation, mgail=mgail)
@@ -67,7 +67,7 @@ def batch_for(kind: str, trainer: Trainer) -> TensorDictBase:
 
 
 def descended(trainer: Trainer, kind: str, batch: TensorDictBase) -> tuple[dict[str, Tensor], Tensor]:
-    """What a loss reports, and its gradient."""
+    """Return what a loss reports, and its gradient."""
     loss = pieces(trainer)[LOSSES[kind]]
     values = loss(batch)
     next(values[key] for key in loss.out_keys if key.startswith("loss_")).backward()
@@ -132,7 +132,7 @@ def of_run(method: str, store: Path, out: Path, rank: int) -> dict[str, Any]:
 
 
 def main(rank: int, store: Path, out: Path) -> None:
-    """What one process does."""
+    """Run one process."""
     os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank)}
     found: dict[str, Any] = {}
     with processes(CPU) as world:
@@ -174,7 +174,7 @@ def fork(action: Callable[..., None], *args: Any) -> int:
 
 
 def both(store: Path, out: Path) -> int:
-    """What two processes do, and then one alone; whether one of them failed."""
+    """Run two processes, and then one alone; return whether one of them failed."""
     warnings.simplefilter("error")
     if Path("/sys/class/net/lo").exists():
         # Else gloo asks for the address of the machine's name, which may have none.

@@ -107,7 +107,7 @@ def track(name: Any, x=0.0, y=2.0, speed=10.0, steps=range(120), kind="car", log
 
 
 def walker(name: str, speed: float = 1.5, steps: range = range(120)) -> list[str]:
-    """Rows of somebody who crosses the road at x = 48, in the file of pedestrians and bicycles."""
+    """Return rows of a person who crosses the road at x = 48, in the file of pedestrians and bicycles."""
     kind = "pedestrian/bicycle,48.0"
     return [f"{name},{k + 1},{100 * k},{kind},{-4 + speed * k / 10:.4f},0.0,{speed}" for k in steps]
 

@@ -38,13 +38,13 @@ DEATHS = (
 
 
 def config(method: Any, store: Path, out: Path) -> TrainConfig:
-    """Of a run with more checkpoints than are kept."""
+    """Return the configuration of a run with more checkpoints than are kept."""
     evaluated = ValidationConfig(data=store, segments=1, rollouts=1)
     return helpers_runs.tiny(method, store, out, steps=STEPS, validation=evaluated, resume=True)
 
 
 def die_at(name: str, count: int, file: str, report: int) -> None:
-    """Have this process killed at an operation that went well so many times."""
+    """Have this process killed at an operation after it went well the given number of times."""
     action: Any = getattr(OWNERS[name], name)
     left = iter(range(count))
 

@@ -1,4 +1,4 @@
-"""What TorchRL's own tests ask of every loss module, and actors and batches for those that imitate."""
+"""The demands of TorchRL's own tests on every loss module, and actors and batches for those that imitate."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def batch(*shape, agents=3, classes=7, continuous=False):
 
 
 def learned(loss, td):
-    """What a loss reports, and the gradients of its parameters."""
+    """Return what a loss reports, and the gradients of its parameters."""
     loss.zero_grad(set_to_none=True)
     out = loss(td)
     next(out[key] for key in loss.out_keys if key.startswith("loss")).sum().backward()

@@ -1,4 +1,4 @@
-"""What an environment computes at a step, written down as plainly as possible: all pairs, no lists, no tables."""
+"""The step of an environment, written down as plainly as possible: all pairs, no lists, no tables."""
 
 from __future__ import annotations
 

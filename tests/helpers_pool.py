@@ -1,4 +1,4 @@
-"""Tasks of a pool of processes, in a module that imports little: a worker of Ray that is lost is begun anew."""
+"""Tasks of a pool of processes, in a module that imports little: a lost worker of Ray is started again."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from symphony import parallel as engine
 def serve_from_here() -> None:
     """Have all processes that are asked for from now on forked from a copy of this one, as it is (Linux).
 
-    A server that began anew would need seconds to import what is imported here.
+    A new server would need seconds to import what is imported here.
     """
     server = forkserver._forkserver
     # Python 3.14's servers want a key; there they begin as in the product.
@@ -66,7 +66,7 @@ def apart(function: Callable[..., Any], *given: Any, said: Path | None = None) -
 
 
 def output_of(function: Callable[..., Any], *given: Any, said: Path, limit: float | None = None) -> str:
-    """What a function prints that :func:`apart` starts and that must end well, within so many seconds."""
+    """Return what a function prints that :func:`apart` starts and that must end well, within some seconds."""
     process = apart(function, *given, said=said)
     process.join(limit)
     process.kill()  # where it hangs
@@ -76,7 +76,7 @@ def output_of(function: Callable[..., Any], *given: Any, said: Path, limit: floa
 
 
 def forget(*packages: str) -> None:
-    """Have packages and modules imported anew from now on, in a process that :func:`apart` has started."""
+    """Have packages and modules imported again from now on, in a process that :func:`apart` has started."""
     for name in list(sys.modules):
         if name.partition(".")[0] in packages:
             del sys.modules[name]

@@ -47,7 +47,7 @@ def turned(points, degrees):
 
 
 def moved_road(road, degrees, shift):
-    """The same map, turned and shifted."""
+    """Return the same map, turned and shifted."""
     xy = turned(road.lanes.points[:, :2].astype(float), degrees) + shift
     points = np.concatenate((xy, road.lanes.points[:, 2:]), axis=1).astype(np.float32)
     return dataclasses.replace(road, lanes=Polylines(points, road.lanes.offsets))

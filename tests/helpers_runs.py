@@ -29,12 +29,12 @@ def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
 
 
 def build(config: TrainConfig) -> Trainer:
-    """What the recipe of a configuration builds, with its hooks, before any training."""
+    """Return what the recipe of a configuration builds, with its hooks, before any training."""
     return trainer_of(config, Processes(torch.device("cpu")))
 
 
 def pieces(trainer: Trainer) -> dict[str, Any]:
-    """What the updates of a recipe use, by the names it gives them."""
+    """Return what the updates of a recipe use, by the names it gives them."""
     found: dict[str, Any] = {}
     todo: list[Any] = [phase.update for phase in trainer.phases]
     while todo:
@@ -59,7 +59,7 @@ def same_weights(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
 
 
 def stopped(run: Path, out: Path, step: int) -> None:
-    """A copy of a run as it was after so many updates."""
+    """Copy a run as it was after some updates."""
     shutil.copytree(run, out)
     for done in checkpoints(out / "checkpoints"):
         if int(done.name[-12:]) > step:

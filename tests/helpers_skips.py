@@ -1,4 +1,4 @@
-"""What skipped tests lack, by kind; `tests/skips.txt` says how many of each may be skipped, the others none."""
+"""The reasons of skipped tests, by kind; `tests/skips.txt` says how many of each may be skipped, the others none."""
 
 from __future__ import annotations
 

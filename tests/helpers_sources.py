@@ -134,7 +134,7 @@ def commonroad(*parts: str, version: str = "2020a", name: str = "ZAM_Made-1_1_T-
 
 
 def signed_area(ring: NDArray[Any]) -> float:
-    """Of a closed ring; positive counter-clockwise."""
+    """Return the signed area of a closed ring; positive counter-clockwise."""
     x, y = ring[:-1, 0], ring[:-1, 1]
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2)
 

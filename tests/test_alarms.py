@@ -1,4 +1,4 @@
-"""What training says when it goes wrong, and when it gives up."""
+"""The messages of a training that goes wrong, and when it gives up."""
 
 from __future__ import annotations
 

@@ -189,7 +189,7 @@ def test_commonroad_odd_things(old: str, new: str, kind: str, example: str, tmp_
 
 @contextmanager
 def little_memory(most: float) -> Iterator[None]:
-    """What is allocated inside stays below so many bytes."""
+    """Check that what is allocated inside stays below a number of bytes."""
     tracemalloc.start()
     try:
         yield

@@ -343,7 +343,7 @@ def test_at_one_height_all_of_it_counts() -> None:
 
 @pytest.mark.parametrize("agent", ["playback", "constant_velocity"])
 def test_an_evaluation_holds_to_it(agent: str, tmp_path: Path) -> None:
-    """Of two segments, one with a bridge, half collide, and nobody is off the road but where both roads are one."""
+    """Of two segments, one with a bridge, half collide, and none are off the road but where both roads are one."""
     fill(tmp_path / "store", [overpass(0.0), overpass(HIGH)])
     how = EvaluateConfig(rollouts=2)
     rates = [evaluate(agent, tmp_path / "store", how, items=items).numbers() for items in ([0], [1], [0, 1])]
@@ -422,7 +422,7 @@ def test_points_and_edges_are_those_of_ones_own_level(count: int) -> None:
 
 
 def test_a_device_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is done where nothing may wait for the device, on the CPU."""
+    """Do on the CPU what is done where nothing may wait for the device."""
     segments = overpass(), straight_road(3, steps=STEPS)
     found = drive(*segments)[1]
     for name in ("envs.flags", "envs.observation", "envs.driving", "geometry.nearest"):

@@ -1,4 +1,4 @@
-"""What sampling alone adds to a divergence, and what a search makes of goals."""
+"""The share of sampling in a divergence, and the effect of a search on goals."""
 
 from __future__ import annotations
 

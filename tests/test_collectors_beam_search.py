@@ -228,7 +228,7 @@ def test_scores_without_agents_of_the_reward_and_of_a_module():
 
 
 def test_scores_of_any_usual_shape_become_one_number_per_agent():
-    """Of three branches: without agents, with one or two, and with a last dimension as TorchRL's rewards have it."""
+    """Score three branches: without agents, with one or two, and with a last dimension like TorchRL's rewards."""
     for shape in ((3,), (3, 1), (3, 2), (3, 1, 1), (3, 2, 1)):
         values = torch.rand(5, *shape)
         found = collectors.KeyScore("score")(TensorDict({"score": values}, [5, 3]))

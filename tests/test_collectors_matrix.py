@@ -165,7 +165,7 @@ def hashed(td: TensorDictBase) -> TensorDictBase:
 
 
 def returns(env: Mass, start: TensorDictBase, value: Any = None) -> tuple[Tensor, Tensor]:
-    """Of each slot the return of its constant action, and that action."""
+    """Return each slot's return of its constant action, and that action."""
     now, total, over = start.unsqueeze(-1).expand(*start.shape, BRANCHES).clone(), 0.0, None
     action = hashed(now)["action"].clone()
     for _ in range(HORIZON):

@@ -49,7 +49,7 @@ class Filtered(EnvBase):
 
 
 def observed(rows: int) -> tuple[Tensor, Tensor, Tensor]:
-    """What is seen [rows, T], and by Kalman's filter its log-evidence and the mean of the last state."""
+    """Return what is seen [rows, T], and by Kalman's filter its log-evidence and the mean of the last state."""
     y, x = [], torch.zeros(rows)
     for _ in range(STEPS):
         x = KEPT * x + torch.randn(rows)
@@ -225,7 +225,7 @@ def test_systematic_of_equals_keeps_all():
 
 
 def replaced(totals, threshold, noise, groups):
-    """What :class:`ReplaceBad` is to do, slot by slot."""
+    """Return what :class:`ReplaceBad` should do, slot by slot."""
     slots = range(len(totals))
     good = [i for i in slots if totals[i] <= threshold]
     parents, turns = list(slots), {}

@@ -136,7 +136,7 @@ def test_speed_limits_of_either_version(path: Path) -> None:
 
 
 def test_what_lies_beside_the_lanes_is_road_and_no_lane(path: Path) -> None:
-    """Nobody's route leads along it, nobody who stands there is off the road, and it is cut where the lanes are."""
+    """No route leads along it, no agent that stands there is off the road, and it is cut where the lanes are."""
     walk = lanelet(30, [(0, 4), (50, 4)], [(0, 2), (50, 2)], "<laneletType>sidewalk</laneletType>")
     cross = lanelet(31, [(20, 2), (20, -2)], [(18, 2), (18, -2)], "<laneletType>crosswalk</laneletType>")
     plain = convert(path, ROAD, driver(7)).road

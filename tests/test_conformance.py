@@ -26,7 +26,7 @@ needs_pyarrow = pytest.mark.skipif(
 
 
 def failing(call: Callable[[], Conformance]) -> Conformance:
-    """What a check finds; something must be wrong."""
+    """Return the findings of a check; something must be wrong."""
     with pytest.raises(ConformanceError) as caught:
         call()
     assert caught.value.report.failures

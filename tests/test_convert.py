@@ -438,7 +438,7 @@ def test_a_worker_dies(paths: list[Path], tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(("what", "message"), [
     ("rate", "rate is 10.0, but the conversion that was interrupted had 5.0"),
     ("fewer", r"the files are others, .* \(.*d\.scene\)"), ("order", "in another order"),
-    ("map", r"were changed, since the conversion was interrupted \(.*b\.map\)"),
+    ("map", r"have changed, since the conversion was interrupted \(.*b\.map\)"),
     ("option", "options is {'option': 'option'}, but .* had {'option': 'usual'}"),
 ])  # fmt: skip
 def test_other_arguments_do_not_go_on(paths: list[Path], tmp_path: Path, what: str, message: str) -> None:
@@ -464,7 +464,7 @@ def test_other_arguments_do_not_go_on(paths: list[Path], tmp_path: Path, what: s
 
 
 def test_a_folder_of_somebodys_own_is_left_alone(paths: list[Path], tmp_path: Path) -> None:
-    """Of the name that unfinished work gets: a folder with notes, and a store."""
+    """A folder with notes and a store, under the name that unfinished work gets."""
     (tmp_path / "store.partial").mkdir()
     (tmp_path / "store.partial" / "notes.txt").write_text("mine")
     convert(FakeReader(), paths[1:2], tmp_path / "other.partial")

@@ -1,4 +1,4 @@
-"""Everyone reacts: who is driven, how agents enter and leave, and what the others do meanwhile."""
+"""Traffic in which everyone reacts: who is driven, how agents enter and leave, and what the others do meanwhile."""
 
 from __future__ import annotations
 
@@ -231,7 +231,7 @@ def test_who_is_driven_is_a_matter_of_choice():
 
 @pytest.mark.parametrize("others", ["constant_velocity", "idm", "learned"])
 def test_others_are_driven_but_not_evaluated(store, others, tmp_path):
-    """The log against itself is at no distance, whoever drives the rest, and goals are those of the evaluated."""
+    """The log against itself is at no distance, whatever drives the rest, and goals are those of the evaluated."""
     config = EvaluateConfig(rollouts=2, search="none", interactive=2, others=others)
     assert evaluate("playback", brief(tmp_path / "brief", [0]), config).numbers()["curvature_jsd"] == 0
     saved = save_simulation(tmp_path / "sim", tiny(), crowd_dataset(store, tiny(), config, [2]), config)[0]
@@ -262,7 +262,7 @@ def test_what_is_saved_shows_who_is_there(store, tmp_path):
 
 
 def test_the_baseline_is_the_planner_for_everyone(store):
-    """Whoever is driven follows the route of the log by the rule, the ego and others alike."""
+    """Driven agents follow the route of the log by the rule, the ego and others alike."""
     config = EvaluateConfig(rollouts=1, interactive=2)
     scenes = crowd_dataset(store, load_agent("idm"), config).scenes([2])
     driven = simulation(load_agent("idm"), scenes, config).rollouts.state
@@ -292,7 +292,7 @@ def test_a_goal_is_a_route_over_its_lane_or_past_its_point():
     for bad in ("7", "7=", "x=1,2", "7=1", "7=a,b", "7=lane:99", "12345=lane:100", "7=9e9,0", "--7=1,2"):
         with pytest.raises(ConfigError, match="goal"):
             asked(bad)
-    with pytest.raises(ConfigError, match="given another one"):
+    with pytest.raises(ConfigError, match="already has another goal"):
         asked(f"{name[0]}=lane:108", f"{name[0]}=lane:110")
     with pytest.raises(ConfigError, match="planner drives"):
         asked(f"{name[0]}=lane:108", planned=True)

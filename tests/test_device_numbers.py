@@ -31,7 +31,7 @@ def as_on_a_device(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def states(env: DrivingEnv, seed: int) -> Any:
-    """Of agents near where they began, every other time both at one place: some beside the road, some far."""
+    """Return states of agents near where they began, every other time both at one place: some beside the road."""
     rng = torch.Generator().manual_seed(seed)
     start = env.with_goals(env.start(torch.arange(len(env.scenes)).repeat_interleave(12)))
     state = start.get(keys.STATE)

@@ -109,7 +109,7 @@ def test_tables_are_those_of_the_records_which_are_few_and_say_how_they_were_mad
 
 
 def anchors(page: Path) -> set[str]:
-    """Of a page's headings, as they are made for it."""
+    """Return the anchors of a page's headings, as they are made for it."""
     headings = re.findall(r"(?m)^#+ (.+)$", page.read_text())
     return {re.sub(r"[^a-z0-9 -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 

@@ -1,4 +1,4 @@
-"""What a policy can see beside the paper's inputs: where others are along its route, gaps, lights."""
+"""The inputs of a policy beside the paper's: where others are along its route, gaps, lights."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def one_route(line: NDArray[np.float64]) -> FollowedRoutes:
 
 
 def see(x: float, y: float, heading: float, line: NDArray[np.float64]) -> torch.Tensor:
-    """What is seen of a route by whoever has come to its point that is nearest."""
+    """Return what an agent sees of a route when it has come to the point that is nearest."""
     state = torch.tensor([[[x, y, heading, 5.0]]], dtype=torch.float64)
     here = SPACING * np.hypot(*(line - [x, y]).T).argmin()
     window = one_route(line).window(torch.tensor([[here]], dtype=torch.float64))

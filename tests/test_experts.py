@@ -40,7 +40,7 @@ DYNAMICS = pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
 
 
 def segments() -> list[RunSegment]:
-    """Of several lengths and time steps, with gaps, with made and recorded traffic."""
+    """Make segments of several lengths and time steps, with gaps, with made and recorded traffic."""
     store = SegmentStore(builtin_store("train"))
     short = straight_road(3, steps=11).replace(dt=0.1)
     hidden = hide(crossing(5), 2, slice(10, 20)), hide(straight_road(5), 1, slice(0, 7))

@@ -158,7 +158,7 @@ SETTINGS = ("bc", "bc_ts_h", "mgail_ts_h")
 
 
 def learned(segments: Sequence[schema.RunSegment], method: Any, out: Path) -> Agent:
-    """What comes of three updates, one of every kind there is, on all segments at once."""
+    """Train three updates, one of every kind there is, on all segments at once."""
     fill(out / "store", list(segments))
     agent = AgentConfig(interactive=1, num_points=12, hidden=8)
     mgail = MGAILConfig(regression=1, head_start=1, rollouts=len(segments), expert_weight=0.5)
@@ -242,7 +242,7 @@ class Spoiled(TensorDictModuleBase):
 
 @cache
 def drives(store: SegmentStore, space: str, cells: int, config: EvaluateConfig) -> None:
-    """That nothing is wrong with an agent whose networks nobody has broken."""
+    """Check that nothing is wrong with an agent whose networks are intact."""
     evaluate(make_agent(space, cells), store, config)
 
 

@@ -61,7 +61,7 @@ def act(env, state):
 
 @pytest.mark.parametrize("config", [MANY, NOTHING])
 def test_steps_and_observations_stay_on_the_device(config):
-    """Of many elements, or none; those of all kinds have gradients, and are seen by networks, below."""
+    """Steps with many elements, or none; those of all kinds have gradients, and are seen by networks, below."""
     env = DrivingEnv(ROADS, Bicycle(), config)
     with placed(env) as device, torch.no_grad():
         number = torch.arange(2, device=device.device)[:, None].expand(2, 3)

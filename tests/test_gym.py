@@ -73,7 +73,7 @@ def test_it_is_the_driving_environment(store):
 
 
 def test_it_sees_what_a_planner_sees(store, tmp_path):
-    """The same record, where a planner drives as it did."""
+    """The record is the same where a planner drives as it did."""
     env = gymnasium.make(NAME, data=store, observation=SMALL, ends_on=()).unwrapped
     env.reset(options={"segment": "crossing-0"})
     mine, states, told = [], [], []

@@ -44,7 +44,7 @@ Trained = Callable[..., Path]
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of the last segment, one vehicle comes into sight after the start."""
+    """Make a store in whose last segment one vehicle comes into sight after the start."""
     late = hide(crossing(5, seed=1, steps=6), 3, slice(0, 4))
     path = tmp_path_factory.mktemp("data") / "store"
     return fill(path, [straight_road(4, steps=5), crossing(4, steps=7), late]).path
@@ -92,7 +92,7 @@ def test_each_method_trains_its_networks_and_tells_of_them(trained, store, tmp_p
 
 
 def test_the_seed_decides_the_weights(trained: Trained, store: Path, tmp_path: Path) -> None:
-    """That the same seed gives the same ones is a matter of checkpoints, and tested with them."""
+    """Whether the same seed gives the same weights is tested with checkpoints."""
     first = weights(trained("bc_ts_h"))
     other = weights(train(tiny("bc_ts_h", store, tmp_path / "other", seed=1)))
     assert not any(same_weights(of(n, other), of(n, first)) for n in ("policy", "goals", "discriminator"))
@@ -190,7 +190,7 @@ def test_names_that_are_unknown_are_refused(store: Path, tmp_path: Path) -> None
 
 
 def test_a_file_that_is_older_than_a_setting_means_what_held_then(tmp_path: Path) -> None:
-    """Of an included agent, too: it learned from routes of points alone."""
+    """It holds for an included agent, too: it learned from routes of points alone."""
     file = tmp_path / "agent.json"
     for kept in ("turns", "points", None):
         values = json.loads(to_json(AgentSpec(action_space="bicycle", dt=0.2, goals=True)))
@@ -212,7 +212,7 @@ def test_checkpoints_must_fall_on_searches(store: Path, tmp_path: Path) -> None:
 
 
 def searched(store: Path, out: Path, **changes: Any) -> tuple[dict[str, Tensor], SearchReplay]:
-    """What the first update of a run with search and goals records, and what it learned from."""
+    """Return what the first update of a run with search and goals records, and what it learned from."""
     trainer = build(tiny("bc_ts_h", store, out, segments=3, **changes))
     record = trainer._update(0)
     return record, pieces(trainer)["replay"]

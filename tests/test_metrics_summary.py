@@ -56,7 +56,7 @@ def random_inputs(seed: int, batch: int = 7, rollouts: int = 4, agents: int = 2,
 
 
 def part(inputs: dict[str, Any], take: list[int]) -> dict[str, Any]:
-    """The same for some of the segments."""
+    """Return the same metrics for some of the segments."""
 
     def of(value: Any) -> Any:
         if isinstance(value, CollisionKinds):
@@ -198,7 +198,7 @@ def test_standard_errors_match_the_bootstrap() -> None:
 
 
 def test_a_group_without_anything_to_count_is_no_sample() -> None:
-    """Of two recordings of which one has no step to compare there is no error, as of one alone."""
+    """With two recordings, one of which has no step to compare, there is no error, as with one alone."""
     inputs = random_inputs(7, batch=4) | {"groups": ["a", "a", "b", "c"]}
     inputs["logged"][3] = False
     full, without = scored(inputs).compute(), scored(part(inputs, [0, 1, 2])).compute()

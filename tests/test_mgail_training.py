@@ -42,7 +42,7 @@ def config(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
 
 
 def written(path: Path, *steps: int) -> Path:
-    """A store of segments of so many steps; one vehicle comes into sight after the start."""
+    """Write a store of segments of some steps; one vehicle comes into sight after the start."""
     late = hide(crossing(5, seed=1, steps=steps[2]), 3, slice(0, 4))
     fill(path, [straight_road(4, seed=0, steps=steps[0]), crossing(4, seed=0, steps=steps[1]), late])
     return path
@@ -55,7 +55,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def seconds(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of 2, 2 and 2.4 s."""
+    """The segments last 2, 2 and 2.4 s."""
     return written(tmp_path_factory.mktemp("seconds") / "store", 11, 11, 13)
 
 

@@ -154,7 +154,7 @@ def test_elsewhere_many_elements_are_encoded_a_part_at_a_time(at_once, monkeypat
 
 
 def scene(*batch, agents=3, seed=0, own=6, objects=(4, 10), points=(60, 9), routes=(6, 7), valid=0.8):
-    """Random observations of so many elements and features; agent 0 has all its routes, the last one none."""
+    """Return random observations of some elements and features; agent 0 has all its routes, the last one none."""
     generator = torch.Generator().manual_seed(seed)
     shape = (*batch, agents)
 

@@ -21,7 +21,7 @@ KINDS = pytest.mark.parametrize("kind", [BCLoss, DistillationLoss])
 
 
 def bc(td, mask=None, key="loss_bc", actor=categorical_actor, **arguments):
-    """What cloning reports of the entries of a mask."""
+    """Return what cloning reports of the entries of a mask."""
     return BCLoss(actor(), **arguments)(td if mask is None else td.clone().set(VALID, mask))[key]
 
 
@@ -73,7 +73,7 @@ def test_distillation_is_one_bc_loss_per_kind(continuous, reduction):
 
 
 def test_weights_of_rollouts_make_a_policy_gradient():
-    """The loss is linear in them; experts have none, and 1 is none."""
+    """The loss is linear in the weights; experts have none, and a weight of 1 is like none."""
     td, loss = batch(30), DistillationLoss(categorical_actor())
     weight, plain = torch.randn(td[VALID].shape), loss(td)["loss_distillation"]
     tds = (td.clone().set(("agents", "weight"), w) for w in (0 * weight + 1, weight))

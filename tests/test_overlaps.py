@@ -34,7 +34,7 @@ def boxes(s: RunSegment, step: int) -> list[shapely.Polygon]:
 
 
 def crowded(seed: int) -> RunSegment:
-    """Agents so near to each other that some overlap; whoever is not there may be where others are."""
+    """Agents so near to each other that some overlap; absent ones may be where others are."""
     segment = random_segment(seed=seed, agents=7)
     gone = np.random.default_rng(seed).random(segment.valid.shape) < 0.3
     position = segment.position - np.float32(0.95) * segment.position[:, 2:3]

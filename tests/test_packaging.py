@@ -1,4 +1,4 @@
-"""What a fresh checkout promises: pinned versions, targets that set themselves up, one-way imports."""
+"""The promises of a fresh checkout: pinned versions, targets that set themselves up, one-way imports."""
 
 from __future__ import annotations
 

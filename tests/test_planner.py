@@ -454,7 +454,7 @@ ROWS = {
 
 @pytest.fixture(scope="module")
 def rows() -> dict[str, Any]:
-    """What IDM does in each."""
+    """Return what IDM does in each."""
     return dict(zip(ROWS, states(*ROWS.values()), strict=True))
 
 

@@ -66,7 +66,7 @@ def media(run: Path) -> list[str]:
 
 
 def numbers_of(run: Path, previews: bool) -> dict[int, dict[str, Any]]:
-    """What was recorded of a run's previews, or of all else but its validation and its speed, by the update."""
+    """Return the records of a run's previews, or of all else but its validation and its speed, by the update."""
     found = {}
     for r in read_metrics(run):
         kept = [k for k in r if not k.startswith(("updates_per_second", "validation_"))]

@@ -1,4 +1,4 @@
-"""What ``import symphony`` names, and how much of the package a training needs."""
+"""The names of ``import symphony``, and how much of the package a training needs."""
 
 from __future__ import annotations
 

@@ -190,7 +190,7 @@ def test_the_ego_alone_is_evaluated_on_request() -> None:
 
 
 def test_contacts_are_those_that_the_simulation_flagged() -> None:
-    """Of the included agent, and of the log: no collision of the flags is missing or made up."""
+    """For the included agent and for the log, no collision of the flags is missing or made up."""
     _, found = searched()
     for saved in [*found, played(straight_road(6), [0, 1]), played(crossing(4), [0, 2])]:
         add_segment(made := Report("made", "interactive"), saved)

@@ -32,7 +32,7 @@ def follows(graph, lanes):
 
 
 def lines_of(graph, found, along=0.0):
-    """Lines of routes that all begin so many metres along their first lanes."""
+    """Return lines of routes that all begin at one distance along their first lanes."""
     return [resampled(route_line(graph, route, along), SPACING) for route in found]
 
 
@@ -170,7 +170,7 @@ curves = st.floats(-1 / 25, 1 / 25)
 
 
 def curved(curvature, length=150.0, aside=0.0):
-    """A line of constant curvature, so many metres to its left."""
+    """Return a line of constant curvature, moved to its left."""
     heading = curvature * np.arange(0.0, length, 1.0)
     points = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], -1), 0)
     return points + aside * np.stack([-np.sin(heading), np.cos(heading)], -1)
@@ -214,7 +214,7 @@ def maps():
 
 
 def own_sharpest(graph, lanes):
-    """What :func:`sharpest` gives for lanes themselves, were each to begin where the one before it ends."""
+    """Return :func:`sharpest` of the lanes themselves, as if each began where the one before it ends."""
     parts, end = [graph.lines[lanes[0]]], graph.lines[lanes[0]][-1]
     for lane in lanes[1:]:
         line = graph.lines[lane] - graph.lines[lane][0] + end

@@ -34,7 +34,7 @@ ABOUT = About("made", 3, {"interactive": "made", "others": "playback"}, {"rollou
 
 
 def assert_same(one, two):
-    """The same arrays of the same types, and the same facts."""
+    """Check for the same arrays of the same types, and the same facts."""
     assert content_hash(one.segment) == content_hash(two.segment)
     (arrays, facts), (others, told) = tensors_of(one), tensors_of(two)
     assert (facts, arrays.keys()) == (told, others.keys())

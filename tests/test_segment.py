@@ -116,7 +116,7 @@ def shifted(name: str, metres: float) -> RunSegment:
 
 
 def across(times: int) -> RunSegment:
-    """The same mark, from one end of the map to the other, again and again."""
+    """Return the same mark, from one end of the map to the other, again and again."""
     marks = Polylines.of([np.array([[-15_000, 0], [15_000, 0]])] * times)
     road = dataclasses.replace(FULL.road, marks=marks, mark_type=np.ones(times, np.uint8))
     return FULL.replace(road=road)

@@ -66,7 +66,7 @@ def test_groups_and_tags_come_back_and_change_no_hash(folder: Path, tmp_path: Pa
         writer.append(straight_road(seed=1).replace(group="drive 1/ö"), tags={"n": 1})
         writer.append(straight_road(seed=2))
         writer.append(straight_road(seed=3), tags={"network": "town-5"})
-        with pytest.raises(DataError, match="no name for a tag"):
+        with pytest.raises(DataError, match="cannot name a tag"):
             writer.append(straight_road(seed=5), tags={"group": "mine"})
     fill(folder, unlike(3), append=True)
     store = SegmentStore(folder)
@@ -235,7 +235,7 @@ def test_killed_before_the_header_was_there(folder: Path, survivors: int) -> Non
 
 
 def watch(path: Path, count: int) -> None:
-    """Open a store again and again until it holds so many segments, verifying all."""
+    """Open a store again and again until it holds enough segments, verifying all."""
     seen = 0
     while seen < count:
         store = SegmentStore(path)

@@ -144,7 +144,7 @@ def test_the_paper_s_figures_are_in_our_units() -> None:
 
 
 def expected(table: dict[str, Any]) -> dict[str, list[tuple[bool, tuple[float, ...]]]]:
-    """Of every cell: whether it is bold, and the numbers in it."""
+    """Return for every cell whether it is bold, and the numbers in it."""
     found: dict[str, list[tuple[bool, tuple[float, ...]]]] = {}
     for row, key in itertools.product(table["rows"], table["columns"]):
         for cell in (row[key], *([row["paper"].get(key, {})] if table["paper"] else [])):
@@ -273,7 +273,7 @@ def test_names_are_file_names_and_differ_however_long_they_are(store: str, paths
 
 
 def test_settings_tell_runs_apart(tmp_path: Path) -> None:
-    """What was evaluated in another setting than its run's own does not count."""
+    """An evaluation in another setting than its run's own does not count."""
     eight: dict[str, Any] = {"agent": {"interactive": 8}}
     kinds: dict[Any, list[dict[str, Any]]] = {
         "main": [{}, {"duration": 0}, {"duration": 10}, {"agent": {}}], "long": [{"duration": 20}], "many": [eight],

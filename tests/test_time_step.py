@@ -1,4 +1,4 @@
-"""The scene knows its time step; whoever learned another one refuses."""
+"""The scene knows its time step; an agent that learned another one refuses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from symphony.recipes import train
 
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[float, Path]:
-    """The same two logs, by steps of 0.1 and of 0.2 seconds."""
+    """Make stores of the same two logs, by steps of 0.1 and of 0.2 seconds."""
     found = {}
     for dt in (0.1, 0.2):
         found[dt] = tmp_path_factory.mktemp("data")

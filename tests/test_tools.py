@@ -96,7 +96,7 @@ def test_absurd_segments_are_known() -> None:
 
 
 def count(out: Path, careful: bool) -> None:
-    """Count to five in files that are whole or not there, or begin anew whatever there is."""
+    """Count to five in files that are whole or not there, or begin again whatever there is."""
     out.mkdir(exist_ok=True)
     for k in range(len(list(out.glob("[0-9].json"))) if careful else 0, 5):
         sum(range(1_000_000))

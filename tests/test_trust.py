@@ -1,4 +1,4 @@
-"""What a stranger's folder may ask for: no code, and no memory that its files don't fill (SECURITY.md)."""
+"""Limits on what a stranger's folder may ask for: no code, and no memory that its files don't fill (SECURITY.md)."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_networks_are_no_larger_than_their_weights(stranger: Callable[..., Path]
 
 
 def npz(path: Path, members: dict[str, tuple[tuple[int, ...], int]]) -> None:
-    """An archive of float32 arrays whose headers claim shapes, with so many bytes of zeros each."""
+    """An archive of float32 arrays whose headers claim shapes, with some bytes of zeros each."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, (shape, size) in members.items():
             header = io.BytesIO()
@@ -127,7 +127,7 @@ def npz(path: Path, members: dict[str, tuple[tuple[int, ...], int]]) -> None:
 
 
 def shard(path: Path, size: int, tag: bytes = b"\x0a", kind: bytes = tarfile.REGTYPE) -> None:
-    """A submission with one member: a message of so many bytes of zeros, or a header of the archive's own."""
+    """A submission with one member: a message of some bytes of zeros, or a header of the archive's own."""
     length = bytes((size >> 7 * k & 0x7F) | (0x80 if size >> 7 * (k + 1) else 0) for k in range(5) if size >> 7 * k)
     head = tag + length if kind == tarfile.REGTYPE else b""
     member = tarfile.TarInfo("a.binproto-00000-of-00001")

@@ -1,4 +1,4 @@
-"""What a user gets wrong: one clear line, nothing lost, and never an old answer for a new question."""
+"""Mistakes of users: one clear line, nothing lost, and never an old answer for a new question."""
 
 from __future__ import annotations
 

@@ -170,7 +170,7 @@ def chromium() -> str:
 
 
 def browse(page: Path, *options: str, place: str = "") -> str:
-    """What a browser without a network makes of a page."""
+    """Return what a browser without a network makes of a page."""
     fixed = ["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--window-size=1200,800"]
     alone = ["--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={page.parent / 'profile'}"]
     command = [chromium(), *fixed, *alone, *options, page.as_uri() + place]
@@ -178,7 +178,7 @@ def browse(page: Path, *options: str, place: str = "") -> str:
 
 
 def driven_page(tmp_path: Path, script: str, found: list[SavedRollouts], planners: int = 1) -> dict[str, Any]:
-    """What a script put into `out` once the page was ready; of planners, so many in turn are of one segment."""
+    """Return what a script put into `out` once the page was ready; planners in turn are of one segment."""
     names = [f"made <i> {number}" for number in range(planners)]
     shown = []
     for saved in found:

@@ -52,7 +52,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SegmentStore:
 
 
 class Seen:
-    """What an evaluation gives, and shows on its way."""
+    """The results of an evaluation, and what it shows on its way."""
 
     def __init__(self, store: SegmentStore, out: Path, **changes: Any) -> None:
         self.progress: list[tuple[int, int]] = []

@@ -123,7 +123,7 @@ def test_vehicles_are_driven_and_people_walk_on(settings, monkeypatch):
 
 @pytest.fixture
 def seen(monkeypatch):
-    """What is simulated: scenes and configurations."""
+    """Record what is simulated: scenes and configurations."""
     found = []
 
     def spied(agent, scenes, config):
@@ -270,7 +270,7 @@ def test_a_shorter_horizon_is_the_beginning_of_the_whole():
 
 
 def halted(window):
-    """Everyone stands where they are at the current step."""
+    """Let all agents stand where they are at the current step."""
     now, still = np.full(window.num_steps, window.current_step), np.zeros_like(window.velocity)
     return window.replace(position=window.position[:, now], heading=window.heading[:, now], velocity=still)
 
@@ -282,7 +282,7 @@ def halted(window):
     (-5.0, 0.0, SignalState.GO, True), (AHEAD + 1, 0.0, SignalState.GO, True),
 ])  # fmt: skip
 def test_who_stands_goes_on_green(away, aside, state, stays):
-    """The first agent sees a light so many metres ahead and to its left."""
+    """The first agent sees a light at some distance ahead and to its left."""
     window = wosac_window(crossing(num_agents=3))
     now, angle, point = window.current_step, window.heading[0, 10], np.full_like(window.signal_point, 1e4)
     cos, sin = np.cos(angle), np.sin(angle)

@@ -43,7 +43,7 @@ KEPT = 20  # findings of one kind that are described
 
 @dataclass
 class Counts:
-    """What came of the inputs of a target so far: how many, how often each outcome, and some of the bad ones."""
+    """The outcomes of a target's inputs so far: how many, how often each outcome, and some of the bad ones."""
 
     inputs: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
@@ -72,7 +72,7 @@ def write(files: Files, folder: Path) -> None:
 
 
 def attempt(target: Target, files: Files, folder: Path) -> tuple[str, str]:
-    """What a target makes of files, in this process."""
+    """Run a target on files, in this process."""
     write(files, folder)
     try:
         with warnings.catch_warnings():
@@ -86,7 +86,7 @@ def attempt(target: Target, files: Files, folder: Path) -> tuple[str, str]:
 
 
 def run(name: str, counts: Counts, total: int, seed: int = 0) -> None:
-    """Go on with a target until so many inputs are counted."""
+    """Go on with a target until the given number of inputs are counted."""
     with tempfile.TemporaryDirectory(dir=PLACE) as folder:  # here, lest each process import everything anew
         attempt(TARGETS[name], dict(TARGETS[name].good()), Path(folder))
     gc.freeze()  # lest each process go through, and so copy, all that was there before it

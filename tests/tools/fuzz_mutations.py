@@ -43,7 +43,7 @@ class Target(NamedTuple):
 
 
 def one_in(many: int, folder: Path) -> bool:
-    """Whether the files of a folder are among the one in so many that more is done with; the same ones always."""
+    """Return whether the files of a folder are among the few with which more is done; always the same ones."""
     return zlib.crc32(b"".join(each.read_bytes() for each in sorted(folder.rglob("*.*")))) % many == 0
 
 

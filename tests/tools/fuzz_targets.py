@@ -1,4 +1,4 @@
-"""What is fuzzed: good files, how they are changed, and what is done with the result.
+"""The targets of the fuzzing: good files, how they are changed, and what is done with the result.
 
 A reader is one entry of :data:`TARGETS`: :func:`reader` with its good files; their suffixes say how they are changed.
 """
@@ -86,7 +86,7 @@ def _read(name: str, folder: Path, file: str) -> tuple[str, str]:
 
 
 def absurd(s: RunSegment) -> str:
-    """What no run segment may have that is taken for a good one, said independently of the schema's own check."""
+    """Return what no valid run segment may have, said independently of the schema's own check."""
     seen = s.valid
     road = np.concatenate([lines.points for lines in (s.road.lanes, s.road.boundary, s.road.marks)])
     way = np.linalg.norm(np.diff(s.position[..., :2].astype(float), axis=1), axis=-1)
@@ -107,7 +107,7 @@ def absurd(s: RunSegment) -> str:
 
 
 def _use(segment: RunSegment, folder: Path) -> None:
-    """What becomes of a good segment: resampled, chosen from, stored, read, and made a scene with routes."""
+    """Use a good segment: it is resampled, chosen from, stored, read, and made a scene with routes."""
     prepared = Preparation(get_reader("commonroad"), 0.2, 0.3, 1)._prepared(segment, "a")
     if not isinstance(prepared, RunSegment):
         if "can't be read:" in prepared.message:
@@ -404,7 +404,7 @@ def _check_submission(folder: Path, file: str) -> tuple[str, str]:
 
 
 def _unfit(file: Path, required: dict[str, set[int]]) -> str:
-    """What a server would refuse in a submission, said independently of the check."""
+    """Return what a server would refuse in a submission, said independently of the check."""
     shards = [content for _, content in _members(io.BytesIO(gzip.decompress(file.read_bytes())))]
     parsed = [pb.SimAgentsChallengeSubmission.FromString(content) for content in shards]
     found = {each.scenario_id: each for shard in parsed for each in shard.scenario_rollouts}

@@ -48,9 +48,9 @@ class Counts:
 
 
 def torment(target: Target, folder: Path, kills: int, seed: int) -> Counts:
-    """Kill work so often, each time at a random moment of what it takes undisturbed, and compare what is left.
+    """Kill work several times, each time at a random moment of what it takes undisturbed, and compare what is left.
 
-    When it comes to its end before it is killed, it begins anew in another folder; so the last one does in the end.
+    When it comes to its end before it is killed, it begins again in another folder; so the last one does in the end.
     """
     rng, counts = np.random.default_rng(seed), Counts()
     status, counts.seconds = live(target, folder / "whole")

@@ -1,4 +1,4 @@
-"""What is killed: everything that writes for longer than a moment, small."""
+"""The targets of kills: everything that writes for longer than a moment, small."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def python(*folders: Path) -> Iterator[tuple[Path, int]]:
 
 
 def long_files(root: Path) -> list[str]:
-    """What is wrong with single files."""
+    """Return what is wrong with single files."""
     found = []
     for file, lines in python(*(root / folder for folder in FOLDERS)):
         most = RECIPE if file.parent.name == "recipes" else LIMIT
@@ -67,7 +67,7 @@ def size(root: Path, room: str) -> int:
 
 
 def large_rooms(root: Path) -> list[str]:
-    """What is wrong with rooms: too large, or not in the table."""
+    """Return what is wrong with rooms: too large, or not in the table."""
     table = (root / TABLE).read_text(encoding="utf-8")
     rows = {row["room"]: row for row in ROW.finditer(table)}
     found = []
@@ -82,7 +82,7 @@ def large_rooms(root: Path) -> list[str]:
 
 
 def number(cell: str) -> int:
-    """What a cell says; 0 where it is empty."""
+    """Return the number in a cell; 0 where it is empty."""
     return int(cell.replace(" ", "") or 0)
 
 

@@ -1,4 +1,4 @@
-"""What scenes with known values are made of: ways, a road, and segments of them.
+"""The parts of scenes with known values: ways, a road, and segments of them.
 
 A road along +x with two lanes east (y = -1.75 and -5.25) and one west (y = 1.75), and one across to the north at
 x = 165. Lights of the eastern lanes are at x = 150. All boxes of cars are 4.5 m by 1.8 m. Metres, seconds, radians.

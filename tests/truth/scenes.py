@@ -28,7 +28,7 @@ def walker(x: float, y: float, speed: float = 1.2, heading: float = NORTH, **mor
 
 
 def stops(track: Track, at: float, braking: float) -> Track:
-    """The same, braking to a stand from some second on."""
+    """Return the same drive, braking to a stand from some second on."""
     return replace(track, change=(at, at + track.speed / braking, -braking))
 
 
@@ -82,7 +82,7 @@ def collisions() -> list[Case]:
 
 
 def manoeuvres() -> list[Case]:
-    """Whose fault it is where the last metres do not tell."""
+    """Scenes whose last metres do not tell whose fault it is."""
     standing = car(80, OWN, 0.0)
     return [
         Case("into one that stands", "what stands is in nobody's way for which it could be blamed", ego(),

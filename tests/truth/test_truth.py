@@ -1,4 +1,4 @@
-"""What a report says of scenes whose right values are known, whatever the phase of the time step and its length."""
+"""The report of scenes whose right values are known, whatever the phase of the time step and its length."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def rollouts(case: Case, dt: float) -> list[SavedRollouts]:
 
 
 def kind_of(saved: SavedRollouts) -> int:
-    """Of the first collision, as the evaluator finds it."""
+    """Return the kind of the first collision, as the evaluator finds it."""
     segment, steps = saved.segment, saved.steps + 1
     pose = np.concatenate([segment.position[..., :2], segment.heading[..., None], segment.velocity], -1)
     found = collision_kinds(
