@@ -1,10 +1,14 @@
 """TorchRL's planners and the beam search at equal simulated steps: python benchmarks/planners.py; some minutes.
 
-Prints the mean return (and its standard error over seeds) of 8 rows; of docs/torchrl.md the table of planners.
+Writes the mean return (and its standard error over seeds) of 8 rows to ``results/planners.json``, the table of
+docs/torchrl.md.
 """
 
 from __future__ import annotations
 
+import json
+import subprocess
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,6 +20,9 @@ from torchrl.modules import CEMPlanner, MPPIPlanner
 from torchrl.objectives.value import TDLambdaEstimator
 
 from symphony.collectors import BeamSearchPlanner, with_rows
+
+ROOT = Path(__file__).resolve().parents[1]
+RECORD = ROOT / "results" / "planners.json"
 
 ROWS, SEEDS, STEPS = 8, 3, {"pendulum": 60, "point": 40, "pole": 60}
 HORIZON, ROUNDS, CANDIDATES = 12, 4, 64
@@ -76,39 +83,60 @@ class Pole(Plane):
         return after, 1 - lean, (after[..., 0].abs() > 2.4) | (lean > 1)
 
 
+MAKERS = {
+    "pendulum": lambda seed: PendulumEnv(seed=seed),
+    "point": lambda seed: Point(4, 2, seed),
+    "pole": lambda seed: Pole(4, 1, seed),
+}
+KINDS = (
+    "random actions", "`CEMPlanner`", "`MPPIPlanner`",
+    "beam search, pruned every 4 of 12 steps", "beam search, not pruned",
+)  # fmt: skip
+
+
 def planner(kind: str, env: EnvBase) -> Any:
     """Return a policy by name; None for random actions."""
-    if kind == "CEM":
+    if kind == "`CEMPlanner`":
         return CEMPlanner(env, HORIZON, ROUNDS, CANDIDATES, 8)
-    if kind == "MPPI":
+    if kind == "`MPPIPlanner`":
         nothing = TensorDictModule(lambda done: torch.zeros(done.shape), ["done"], ["state_value"])
         value = TDLambdaEstimator(gamma=1.0, lmbda=1.0, value_network=nothing)
         return MPPIPlanner(env, value, 1.0, HORIZON, ROUNDS, CANDIDATES, 8)
-    if kind == "random":
+    if kind == "random actions":
         return None
-    return BeamSearchPlanner(env, HORIZON, ROUNDS * CANDIDATES, prune_every=int(kind.removeprefix("beam every ")))
+    return BeamSearchPlanner(env, HORIZON, ROUNDS * CANDIDATES, prune_every=HORIZON if "not" in kind else 4)
 
 
 @torch.no_grad()
+def measured(name: str, kind: str) -> list[float]:
+    """The mean return over seeds, and its standard error."""
+    returns = []
+    for seed in range(SEEDS):
+        torch.manual_seed(seed)
+        env = MAKERS[name](seed)
+        found = with_rows(env, [ROWS]).rollout(STEPS[name], planner(kind, env), break_when_any_done=False)
+        done = found["next", "done"].long()
+        going = done.cumsum(-2) - done == 0
+        returns.append((found["next", "reward"] * going).sum(-2).mean())
+    return [float(torch.stack(returns).mean()), float(torch.stack(returns).std()) / SEEDS**0.5]
+
+
 def main() -> None:
-    """Print a line for each planner and environment."""
-    makers = {
-        "pendulum": lambda seed: PendulumEnv(seed=seed),
-        "point": lambda seed: Point(4, 2, seed),
-        "pole": lambda seed: Pole(4, 1, seed),
+    """Print each planner's return in each environment, and write the record."""
+    rows: list[list[Any]] = [[kind] for kind in KINDS]
+    for name in MAKERS:
+        for row in rows:
+            row.append(measured(name, row[0]))
+            print(f"{name:9} {row[0]:40} {row[-1][0]:7.1f} +- {row[-1][1]:.1f}", flush=True)
+    git = ["git", "rev-parse", "--short", "HEAD"]
+    commit = subprocess.check_output(git, cwd=ROOT, text=True).strip()  # noqa: S603
+    record = {
+        "of": f"mean return of {ROWS} rows, {HORIZON * ROUNDS * CANDIDATES} simulated steps an action; {SEEDS} seeds",
+        "made": {"commit": commit, "command": "python benchmarks/planners.py"},
+        "columns": [[""], *([name, int(name != "pendulum")] for name in MAKERS)],
+        "rows": rows,
     }
-    for name, make in makers.items():
-        for kind in ("random", "CEM", "MPPI", "beam every 4", "beam every 12"):
-            returns = []
-            for seed in range(SEEDS):
-                torch.manual_seed(seed)
-                env = make(seed)
-                found = with_rows(env, [ROWS]).rollout(STEPS[name], planner(kind, env), break_when_any_done=False)
-                done = found["next", "done"].long()
-                going = done.cumsum(-2) - done == 0
-                returns.append((found["next", "reward"] * going).sum(-2).mean())
-            mean, error = torch.stack(returns).mean(), torch.stack(returns).std() / SEEDS**0.5
-            print(f"{name:9} {kind:13} {mean:7.1f} +- {error:.1f}", flush=True)
+    RECORD.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

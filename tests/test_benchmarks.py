@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import shutil
 from functools import partial
 from pathlib import Path
@@ -117,6 +118,19 @@ def test_reinforcement_learning_is_recorded(program: Any, tmp_path: Path, monkey
     assert (tmp_path / "a.png").stat().st_size > 5000
     record = learning.record(runs)
     assert [len(row) for row in record["rows"]] == [len(record["columns"])] * 4
+
+
+def test_planners_are_recorded(program: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    planners, small = program("planners"), {"ROWS": 2, "SEEDS": 2, "HORIZON": 8, "ROUNDS": 2, "CANDIDATES": 16}
+    small |= {"STEPS": dict.fromkeys(planners.MAKERS, 3)}
+    for name, value in (small | {"RECORD": tmp_path / "a.json"}).items():
+        monkeypatch.setattr(planners, name, value)
+    planners.main()
+    record = json.loads((tmp_path / "a.json").read_bytes())
+    assert [len(row) for row in record["rows"]] == [len(record["columns"])] * 5
+    pole = [row[-1][0] for row in record["rows"]]
+    assert max(pole) <= 3
+    assert pole[0] < min(pole[1:])
 
 
 def test_an_average_is_the_mean_of_the_checkpoints(program: Any, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from helpers_collectors import Mass
 from symphony.collectors import BeamSearchCollector, BeamSearchPlanner, KeepAll, KeepBest, KeyScore, with_rows
 
 ROWS, STEPS = 3, 8
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore:.*VecNormV2:FutureWarning")
 
 ENVIRONMENTS: dict[str, Callable[[], envs.EnvBase]] = {
     "rows": lambda: with_rows(Mass(), [ROWS]), "sticky": lambda: with_rows(Mass(sticky=True), [ROWS]),
@@ -34,6 +34,7 @@ TRANSFORMS: dict[str, Callable[[Any], list[envs.Transform]]] = {
     "norm": lambda key: [envs.ObservationNorm(0.1, 2.0, in_keys=[key], standard_normal=True)],
     "frames": lambda key: [envs.CatFrames(3, -1, in_keys=[key], padding="same")],
     "statistics": lambda key: [envs.VecNormV2(in_keys=[key], reduce_batch_dims=True)],
+    "statistics, old": lambda key: [envs.VecNorm(in_keys=[key], new_api=False)],
 }
 
 
@@ -43,9 +44,9 @@ def acting(key: Any, features: int) -> TensorDictModule:
     return TensorDictModule(nn.Sequential(nn.Linear(features, 1), nn.Tanh()), [key], [action])
 
 
-def recurrent() -> tuple[modules.GRUModule, TensorDictSequential]:
+def recurrent(features: int = 2) -> tuple[modules.GRUModule, TensorDictSequential]:
     torch.manual_seed(0)
-    memory = modules.GRUModule(input_size=2, hidden_size=4, in_key="observation", out_key="embedding")
+    memory = modules.GRUModule(input_size=features, hidden_size=4, in_key="observation", out_key="embedding")
     head = nn.Sequential(nn.Linear(4, 2), NormalParamExtractor())
     both = TensorDictSequential(memory, TensorDictModule(head, ["embedding"], ["loc", "scale"]))
     return memory, modules.ProbabilisticActor(both, ["loc", "scale"], distribution_class=modules.TanhNormal)
@@ -81,7 +82,7 @@ def assert_same_until_done(env: Callable[[], envs.EnvBase], policy: Any, **kwarg
     (e, t, inside)
     for e, t, inside in itertools.product(ENVIRONMENTS, TRANSFORMS, (False, True))
     # TorchRL's CatFrames takes no reset of each agent apart.
-    if (t == "statistics") == (e == "endless") and (e, t) != ("agents", "frames")
+    if t.startswith("statistics") == (e == "endless") and (e, t) != ("agents", "frames")
     if not inside or e not in ("one", "own batch")
 ])  # fmt: skip
 def test_one_branch_is_torchrls_collector(env, transforms, inside):
@@ -100,6 +101,23 @@ def test_one_branch_is_torchrls_collector(env, transforms, inside):
     found = assert_same_until_done(make, acting(key, 6 if transforms == "frames" else 2), key=reward)
     if env == "rows" and transforms == "none":
         assert not found["collector", "mask"].all()
+
+
+@pytest.mark.parametrize(
+    ("env", "inside"), [("rows", False), ("rows", True), ("sticky", False), ("own batch", False)]
+)
+@pytest.mark.parametrize("transforms", ["none", "counters", "frames"])
+def test_one_branch_with_memory_is_torchrls_collector(env, inside, transforms):
+    memory, _ = recurrent(6 if transforms == "frames" else 2)
+    policy = TensorDictSequential(memory, TensorDictModule(nn.Linear(4, 1), ["embedding"], ["action"]))
+
+    def make() -> envs.EnvBase:
+        added = [envs.InitTracker(), memory.make_tensordict_primer(), *TRANSFORMS[transforms]("observation")]
+        base = Mass() if inside else ENVIRONMENTS[env]()
+        made = envs.TransformedEnv(base, envs.Compose(*added))
+        return with_rows(made, [ROWS]) if inside else made
+
+    assert_same_until_done(make, policy)
 
 
 @pytest.mark.parametrize("env", ["rows", "own batch", "one"])
@@ -149,10 +167,14 @@ def test_rows_are_a_batch_of_an_environment():
 def test_what_can_not_be_right_is_refused():
     seen = {"in_keys": ["observation"]}
     twice = envs.Compose(envs.CatFrames(2, -1, **seen), envs.ObservationNorm(0.0, 1.0, **seen))
-    for transform, why in ((envs.VecNormV2(**seen), "reduce_batch_dims"), (twice, "must come after")):
+    pool = envs.TimeMaxPool(**seen, T=2)
+    wrong = ((envs.VecNormV2(**seen), "reduce_batch_dims"), (twice, "must come after"), (pool, "TimeMaxPool keeps"))
+    for transform, why in wrong:
         env = envs.TransformedEnv(with_rows(Mass(), [ROWS]), transform)
         with pytest.raises(ValueError, match=why):
             beams(env, None, branches=2).next()
+        with pytest.raises(ValueError, match=why):
+            with_rows(envs.TransformedEnv(Mass(), transform.clone()), [ROWS])
 
 
 HORIZON, BRANCHES = 6, 8
@@ -164,23 +186,24 @@ def hashed(td: TensorDictBase) -> TensorDictBase:
     return td.set("action", (slots * 12.9898 + td["place"].sum(-1, keepdim=True) * 0).sin())
 
 
-def returns(env: Mass, start: TensorDictBase, value: Any = None) -> tuple[Tensor, Tensor]:
+def returns(env: envs.EnvBase, start: TensorDictBase, value: Any = None) -> tuple[Tensor, Tensor]:
     """Return each slot's return of its constant action, and that action."""
-    now, total, over = start.unsqueeze(-1).expand(*start.shape, BRANCHES).clone(), 0.0, None
-    action = hashed(now)["action"].clone()
+    now, total = start.unsqueeze(-1).expand(*start.shape, BRANCHES).clone(), 0.0
+    action, came = hashed(now.copy())["action"], now
     for _ in range(HORIZON):
         after = env.step(now.clone().set("action", action))["next"]
-        over = torch.zeros_like(after["done"]) if over is None else over
-        total = total + torch.where(over, 0.0, after["reward"])
-        over = over | after["done"]
+        total = total + torch.where(came["done"], 0.0, after["reward"])
         now = after.exclude("reward")
-    ahead = 0.0 if value is None else torch.where(over, 0.0, value(now["place"]))
+        came = torch.where(came["done"].squeeze(-1), came, now)
+    ahead = 0.0 if value is None else torch.where(came["terminated"], 0.0, value(came["place"]))
     return (total + ahead).squeeze(-1), action
 
 
 @pytest.mark.parametrize("valued", [False, True])
-def test_without_pruning_it_is_the_best_of_all_branches(valued):
-    env = Mass()
+@pytest.mark.parametrize("limit", [None, HORIZON - 2])
+def test_without_pruning_it_is_the_best_of_all_branches(valued, limit):
+    """A value counts where episodes go on, and where they were truncated, but not where they have terminated."""
+    env = envs.TransformedEnv(Mass(limit=0.8), envs.StepCounter(limit))
     start = with_rows(env, [ROWS]).reset()
 
     def worth(place: Tensor) -> Tensor:
@@ -196,6 +219,13 @@ def test_without_pruning_it_is_the_best_of_all_branches(valued):
     torch.testing.assert_close(planned["planner", "weight"], torch.softmax(expected / 0.5, -1))
     torch.testing.assert_close(planned["planner", "value"].squeeze(-1), expected.amax(-1))
     torch.testing.assert_close(planned["planner", "action"], actions)
+
+
+def test_agents_of_a_group_are_planned_for():
+    env = with_rows(Mass(agents=2), [ROWS])
+    keys = {"reward_key": ("agents", "reward"), "action_key": ("agents", "action")}
+    planned = env.rollout(3, BeamSearchPlanner(env, HORIZON, BRANCHES, **keys), break_when_any_done=False)
+    assert planned["planner", "action"].shape == (ROWS, 3, BRANCHES, 2, 1)
 
 
 @pytest.mark.filterwarnings("ignore:Nested TransformedEnvs:UserWarning")

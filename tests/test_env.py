@@ -18,6 +18,7 @@ from torchrl.modules import AdditiveGaussianModule
 
 from helpers_segments import crossing, straight_road, turned
 from symphony import DrivingEnv, ObservationConfig, keys
+from symphony.collectors import with_rows
 from symphony.envs import Bicycle, ConstantVelocity, Displacement, collate, scene
 from symphony.envs import flags as module
 from symphony.envs.flags import collision_flags
@@ -89,6 +90,7 @@ def test_double_by_default_changes_no_number(dynamics):
         try:
             env = make_env(dynamics=dynamics)
             found.append(run(env, env.start(torch.tensor([0, 1])), plan))
+            check_env_specs(with_rows(env, [2]))
         finally:
             torch.set_default_dtype(torch.float32)
     for key in (keys.STATE, keys.OWN, keys.OBJECTS, keys.POINTS):

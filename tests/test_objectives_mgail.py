@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import pytest
 import torch
@@ -277,24 +278,31 @@ def test_bad_calls_are_refused(env):
             make(env, **bad)
 
 
-def test_an_episode_ends_once():
-    """An environment that comes back into its bounds is scored like one that stays out."""
+@pytest.mark.parametrize("agents", [None, 2])
+def test_an_episode_ends_once(agents):
+    """An environment that comes back into its bounds is scored like one that stays out, unless told otherwise."""
     torch.manual_seed(0)
-    names = ["loc", "scale"]
+
+    def of(*names: str) -> list[Any]:
+        return list(names) if agents is None else [("agents", name) for name in names]
+
     how = {"distribution_class": IndependentNormal, "default_interaction_type": "random"}
-    body = TensorDictModule(nn.Sequential(nn.Linear(2, 2), NormalParamExtractor()), ["place"], names)
-    head = ProbabilisticTensorDictModule(names, ["action"], **how)
-    policy = ProbabilisticTensorDictSequential(body, head)
-    far = TensorDictModule(lambda place: place[..., 0].abs(), ["place"], ["score"])
-    start = with_rows(Mass(), [30]).reset()
+    body = TensorDictModule(nn.Sequential(nn.Linear(2, 2), NormalParamExtractor()), of("place"), of("loc", "scale"))
+    named = dict(zip(("loc", "scale"), of("loc", "scale"), strict=True))
+    policy = ProbabilisticTensorDictSequential(body, ProbabilisticTensorDictModule(named, of("action"), **how))
+    far = TensorDictModule(lambda place: place[..., 0].abs(), of("place"), of("score"))
+    start = with_rows(Mass(agents=agents), [30]).reset()
     values = []
-    for sticky in (True, False):
+    for sticky, until in ((True, True), (False, True), (False, False)):
         torch.manual_seed(0)
-        how = {"horizon": 12, "reduction": "none", "use_mask": False, "cost": "logit"}
-        loss = MGAILLoss(policy, far, Mass(sticky=sticky), **how)
-        loss.set_keys(score="score")
+        how = {"horizon": 12, "reduction": "none", "use_mask": False, "cost": "logit", "until_done": until}
+        loss = MGAILLoss(policy, far, Mass(agents=agents, sticky=sticky), **how)
+        loss.set_keys(score=of("score")[0], done=of("done")[0])
         values.append(loss(start)["loss_mgail"].detach())
-    assert torch.equal(*values)
+    assert torch.equal(*values[:2])
+    assert values[0].shape == (30, 12, *([] if agents is None else [agents]))
     assert (values[0] > 1.5).any()
-    over = (values[0] > 1.5).cumsum(-1)
+    over = (values[0] > 1.5).cumsum(1)
     assert (values[0][over > 1] == 0).all()
+    assert (values[2] != 0).all()
+    torch.testing.assert_close(values[2][values[0] != 0], values[0][values[0] != 0])

@@ -15,12 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import step_mdp
+from torchrl.envs.utils import check_env_specs, step_mdp
 
 from helpers_agents import make_agent
 from helpers_segments import crossing, make_road, make_segment, straight_road
 from helpers_store import fill
-from symphony import keys, load_agent
+from symphony import SegmentStore, builtin_store, keys, load_agent
 from symphony.collectors import Backtrack, KeepBest, with_rows
 from symphony.config import EvaluateConfig, SearchConfig
 from symphony.envs import Bicycle, DrivingEnv, ObservationConfig, scene
@@ -203,6 +203,18 @@ def test_route_goals_are_given_at_each_reset_and_kept_after(scenes, agent, drawn
     held = base.with_goals(base.start(row), torch.zeros_like(goal))
     assert torch.equal(env.reset(held, set_state=True)[keys.GOAL], held[keys.GOAL])
     assert TransformedEnv(base, RouteGoals(agent.goals)).rollout(2).shape == (2,)
+
+
+def test_an_included_agent_drives_where_doubles_are_the_default():
+    torch.set_default_dtype(torch.float64)
+    try:
+        agent = load_agent("pretrained:bc_ts_h")
+        data = SceneDataset(SegmentStore(builtin_store("train")), 1, agent.dynamics, [0, 1], routes=True)
+        driving = TransformedEnv(DrivingEnv(data, agent.dynamics, agent.observation), RouteGoals(agent.goals))
+        check_env_specs(with_rows(driving, [2]))
+        assert with_rows(driving, [2]).rollout(2, agent.policy)[keys.STATE].dtype == torch.float32
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 def test_agents_that_need_routes_and_have_none_say_so(dataset, scenes):

@@ -231,7 +231,10 @@ def build_agent(name: str, spec: AgentSpec) -> Agent:
     """Build an agent with fresh networks; seed torch beforehand."""
     policy, goals = policy_network(spec), goal_network(spec) if spec.goals else None
     discriminator = None if spec.discriminator is None else discriminator_network(spec)
-    return Agent(name, policy, spec, goals, discriminator)
+    agent = Agent(name, policy, spec, goals, discriminator)
+    for module in agent.modules.values() if torch.get_default_dtype() != torch.float32 else ():
+        module.float()  # as what they observe is
+    return agent
 
 
 def load_agent(name: str, device: str = "cpu", *, trust_code: bool = False) -> Agent:

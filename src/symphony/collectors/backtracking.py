@@ -84,7 +84,7 @@ class Course:
 class Run(NamedTuple):
     """A period of branches [*b, S] (of lines [R, 1]) as simulated: the kept entries of its steps, their scores, which
     are 0 after the end of an episode, which steps came before (or were) the end of each agent's episode, or of all
-    agents' (K = 1), which episodes have ended, and the last states.
+    agents' (K = 1), which episodes have ended, the last states, and their values (or of those that ended episodes).
     """
 
     records: list[TensorDictBase]
@@ -92,6 +92,7 @@ class Run(NamedTuple):
     alive: Bool[Tensor, "*b S T K"]
     ended: Bool[Tensor, "*b S K"]
     after: TensorDictBase
+    worth: Float[Tensor, "*b S"] | None = None
 
 
 @torch.no_grad()

@@ -139,7 +139,8 @@ def beam_search(
         aggregate: of the scores of a period [*b, S, T_p, N] to totals [*b, S]: an :class:`Aggregate`, which leaves
             out steps after an end, or any function, e.g. ``lambda scores: scores.amax((-1, -2))``.
         value: of the state after a period, [*b, S] in the units of the totals and high where much is still to come
-            that is bad; added to what the rule sees of branches whose episode goes on.
+            that is bad; added to what the rule sees, but where the episode has terminated. Where it was truncated, it
+            is that of the state in which it was.
         accumulate: the rule sees the sum of the totals of a branch's whole history, not those of the period alone.
         prune_last: prune after the last period too.
         until_done: False if ends of episodes are to change nothing at all.
@@ -170,7 +171,7 @@ def beam_search(
     one_step = _compiled(whole, compile_step) if compile_step else _step
     # What a policy only writes is made again at each step; all else, such as its memory, is carried on.
     written = [key for key in getattr(policy, "out_keys", ()) if key not in getattr(policy, "in_keys", ())]
-    how = start.shape, policy, score, aggregate, keep, until_done, one_step, start, written
+    how = start.shape, policy, score, aggregate, keep, until_done, one_step, start, written, value
     # One program for lines that go back, also when the last of them are few.
     width = min(rule.width or start.numel(), start.numel()) if isinstance(rule, Backtrack) else 0
     simulation = Simulation(env, whole, *how, width if compile_step else 0)
@@ -184,12 +185,13 @@ def beam_search(
         periods = [min(prune_every, steps - first) for first in range(0, steps, prune_every)]
         pruning = Pruning(start, rule, len(periods), group_key=group_key, noise=noise, accumulate=accumulate)
         now, records, scores, alive = start, [], [], []
+        worth: Any = None if value is None else 0.0
         for period, length in enumerate(periods):
             run = simulation.run(now, ended, length)
             records += run.records
             scores.append(run.scores)
             alive.append(run.alive)
-            worth = None if value is None else torch.where(run.ended.all(-1), 0.0, value(run.after)).detach()
+            worth = None if run.worth is None else torch.where(ended.all(-1), worth, run.worth).detach()
             last = period == len(periods) - 1
             active = run.alive[..., 0, :].any(-1).any(-1)
             parents = pruning.prune(simulation.total(run), active, worth, keep_all=last and not prune_last)
@@ -197,6 +199,7 @@ def beam_search(
                 place = _places(parents, start)
                 now, ended = take(run.after, place), take_values(run.ended, place, start.ndim)
                 now = now.update(run.after.select(*slot_keys))
+                worth = None if worth is None else take_values(worth, place, start.ndim)
             del run  # or its last states live through the next period
 
     tree = TensorDict.stack(records, -1)
@@ -262,6 +265,7 @@ class Simulation:
     step: Callable[..., tuple[TensorDictBase, TensorDictBase, Tensor, Tensor]]
     start: TensorDictBase
     written: Sequence[NestedKey]
+    value: Score | None = None
     width: int = 0  # lines that are simulated at a time, the last again where there are fewer
 
     def run(self, now: TensorDictBase, ended: Bool[Tensor, "*b S K"], length: int) -> Run:
@@ -274,22 +278,28 @@ class Simulation:
         env = self.whole if now.shape == self.shape else branched_env(self.env, now.shape)
         recall(env, now)
         # Policy and environment write into the TensorDict they are given.
-        now, records, scores, ends = now.copy(), [], [], [ended]
+        now, records, scores, ends, came = now.copy(), [], [], [ended], None
         for _ in range(length):
             now = now if self.step is _step else _ordered(now.exclude(*self.written), self.start)
             kept, now, worth, end = self.step(env, self.policy, self.score, self.keep, now)
             records.append(kept)
             scores.append(worth)
+            if self.value is not None:  # the states in which episodes ended, or that they have come to
+                over = torch.stack(ends).any(0).all(-1) & self.until_done
+                came = now.copy() if came is None else torch.where(over, came, now)
             ends.append(end)
-        joined = torch.stack(scores, -2)
+        joined, ahead = torch.stack(scores, -2), None
+        if came is not None and self.value is not None:
+            terminated = _ended(self.env, came, came.ndim, "terminated").all(-1) & self.until_done
+            ahead = torch.where(terminated, 0.0, self.value(came))
         if not self.until_done:
             alive = torch.ones(*joined.shape[:-1], 1, dtype=torch.bool, device=joined.device)
-            return Run(records, joined, alive, ended, now)
+            return Run(records, joined, alive, ended, now, ahead)
         over = torch.stack(ends, -2).cumsum(-2) > 0
         alive = ~over[..., :-1, :]
         if alive.shape[-1] not in (1, joined.shape[-1]):
             alive = alive.any(-1, keepdim=True)
-        return Run(records, torch.where(alive, joined, 0.0), alive, over[..., -1, :], now)
+        return Run(records, torch.where(alive, joined, 0.0), alive, over[..., -1, :], now, ahead)
 
     def total(self, run: Run, length: int | None = None) -> Float[Tensor, "*b S"]:
         """Return the totals of a period, or of its first steps alone."""
@@ -348,9 +358,9 @@ def _ordered(state: TensorDictBase, like: TensorDictBase) -> TensorDictBase:
     return TensorDict(entries, state.batch_size, device=state.device)
 
 
-def _ended(env: EnvBase, state: TensorDictBase, batch: int) -> Bool[Tensor, "*b S K"]:
+def _ended(env: EnvBase, state: TensorDictBase, batch: int, how: str = "done") -> Bool[Tensor, "*b S K"]:
     """Return whether the episode is done, for each of K agents if they end separately, else for all (K = 1)."""
-    names = [below(key)[1:] for key in env.done_keys if last_name(key) == "done"]
+    names = [below(key)[1:] for key in env.done_keys if last_name(key) == how]
     # As TorchRL has it, the end of a group is that of all that is nested in it.
     outer = [n for n in names if not any(len(o) < len(n) and n[: len(o) - 1] == o[:-1] for o in names)]
     flags = [state.get(key).flatten(batch) for key in outer if state.get(key, None) is not None]

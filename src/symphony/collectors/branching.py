@@ -18,8 +18,10 @@ from torchrl.envs import (
     Compose,
     EnvBase,
     TensorDictPrimer,
+    TimeMaxPool,
     Transform,
     TransformedEnv,
+    VecNorm,
     VecNormV2,
 )
 
@@ -98,6 +100,8 @@ def with_rows(env: EnvBase, batch_size: Sequence[int]) -> TransformedEnv:
     """
     base, transforms = parts_of(env)
     _check_shape(base, torch.Size(batch_size))
+    for number, transform in enumerate(transforms):
+        _check_transform(transform, transforms[number + 1 :])
     rows = BatchedEnv(base, batch_size)
     return TransformedEnv(rows, Compose(*(transform.clone() for transform in transforms)))
 
@@ -123,7 +127,7 @@ def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> E
             # It adds the batch of its environment to its specs, but can't replace another one.
             first = (0,) * len(env.batch_size)
             copy.primers = copy.primers[first] if first else copy.primers.clone()
-        if isinstance(copy, VecNormV2) and not share:
+        if isinstance(copy, VecNorm | VecNormV2) and not share:
             copy.freeze()
         copies.append(copy)
     return TransformedEnv(BatchedEnv(base, shape), Compose(*copies))
@@ -154,6 +158,8 @@ def _check_shape(base: EnvBase, shape: torch.Size) -> None:
 def _check_transform(transform: Transform, later: Sequence[Transform]) -> None:
     if isinstance(transform, VecNormV2) and not transform.reduce_batch_dims:
         raise ValueError("VecNormV2 needs reduce_batch_dims=True: its statistics are those of all branches")
+    if isinstance(transform, TimeMaxPool):
+        raise ValueError("TimeMaxPool keeps frames that are not in the TensorDict; CatFrames has them there")
     written = {key for other in later for key in other.out_keys or ()}
     if isinstance(transform, CatFrames) and written & set(transform.out_keys):
         raise ValueError("CatFrames must come after other transforms of the entries that it writes")

@@ -56,7 +56,7 @@ class BeamSearchPlanner(MPCPlannerBase):
         check_branching(env)
         super().__init__(parts_of(env)[0], action_key)
         # What is searched has rows and transforms, which TorchRL's planners know nothing of.
-        self.env, self.action_spec = env, env.action_spec
+        self.env, self.action_spec = env, env.full_action_spec[action_key]
         self.planning_horizon, self.branches, self.prune_every = planning_horizon, branches, prune_every
         self.policy, self.value_network, self.rule, self.noise = policy, value_network, rule, noise
         self.temperature, self.reward_key, self.action_key = temperature, reward_key, action_key

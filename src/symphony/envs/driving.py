@@ -82,9 +82,9 @@ class DrivingEnv(EnvBase):
         generator: draws them instead.
         device: of the scenes from a source; others stay where they are.
 
-    ``reset`` starts the scenes named in the ``scene`` entry of its argument, or draws them at random if there is
-    none; where only some rows are reset, they start other scenes of those at hand. ``reset(state, set_state=True)``
-    starts from the given simulation state. Raises a :class:`ConfigError` for an unknown name in ``ends_on`` or
+    ``reset(rows, set_state=False)`` starts the scenes named in their ``scene`` entry, or draws them at random;
+    where only some rows are reset, they start other scenes of those at hand. ``reset(state, set_state=True)`` starts
+    from the given simulation state. Raises a :class:`ConfigError` for an unknown name in ``ends_on`` or
     ``after_collision``, both seed and generator, routes observed and not there, or agents that leave where traffic
     is not open.
     """
@@ -192,7 +192,7 @@ class DrivingEnv(EnvBase):
             action: Any = Categorical(self.dynamics.num_actions, shape=(n,), dtype=torch.int64, device=device)
         else:
             bounds = self.dt * torch.tensor(BOUNDS, dtype=torch.float32)[:, None].expand(2, n, 2)
-            action = Bounded(*bounds, device=device)
+            action = Bounded(*bounds, device=device, dtype=torch.float32)
         self.action_spec, self.reward_spec = rows(action=action), rows(reward=numbers(n, 1))
         self.done_spec = Composite(done=flags(1), terminated=flags(1), truncated=flags(1))
 

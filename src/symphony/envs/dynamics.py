@@ -194,7 +194,7 @@ class Displacement:
         self, state: Float[Tensor, "*b 4"], action: Float[Tensor, "*b 2"], size: Sizes, dt: float
     ) -> Float[Tensor, "*b 4"]:
         """Apply displacements in metres."""
-        return displacement_step(state, action, size[..., 0], dt)
+        return displacement_step(state, action.to(state.dtype), size[..., 0], dt)
 
     @torch.no_grad()
     def fit(

@@ -82,7 +82,7 @@ def observation_spec(config: ObservationConfig, agents: int, device: torch.devic
     spec = Composite(shape=(agents,))
     for name, width in widths.items():
         if all(width):
-            spec[name] = Unbounded(shape=(agents, *width), device=device)
+            spec[name] = Unbounded(shape=(agents, *width), device=device, dtype=torch.float32)
             if name in ("objects", "points", "lights"):
                 spec[f"{name}_mask"] = Binary(shape=(agents, width[0]), dtype=torch.bool, device=device)
     return spec

@@ -298,7 +298,7 @@ def along_route(
     length = (along_x.square() + along_y.square()).sqrt().clamp_min(1e-3)
     along_x, along_y = along_x / length, along_y / length
     away_x, away_y = x - first_x, y - first_y
-    along = SPACING * start + (away_x * along_x + away_y * along_y)
+    along = SPACING * start.to(x.dtype) + (away_x * along_x + away_y * along_y)
     left = along_x * away_y - along_y * away_x
     speed = speed_x * along_x + speed_y * along_y
     end = SPACING * (count - 1)

@@ -358,13 +358,9 @@ class DistillationLoss(ActorLoss):
         if tensordict.get(self.tensor_keys.weight, None) is not None:
             cost = cost * self._entries(tensordict, self.tensor_keys.weight, "weight", shape)
         reduction: Reduction = "none" if self.reduction == "none" else "mean"
-        result = TensorDict(
-            {
-                "loss_distillation": self._reduced(fit.cost, expert) + self._reduced(cost, rollout),
-                "nll_expert": self._reduced(fit.nll, expert, reduction),
-                "nll_rollout": self._reduced(fit.nll, rollout, reduction),
-                **self._statistics(fit, expert),
-            }
-        )
+        nll = [self._reduced(fit.nll, kind, reduction) for kind in (expert, rollout)]
+        loss = self._reduced(fit.cost, expert) + self._reduced(cost, rollout)
+        found = {"loss_distillation": loss, "nll_expert": nll[0], "nll_rollout": nll[1]}
+        result = TensorDict(found | self._statistics(fit, expert))
         self._clear_weakrefs(tensordict, result, "actor_network_params")
         return result

@@ -104,12 +104,8 @@ class GoalLoss(MaskedLoss):
                 "accuracy": best[..., 0].to(logits.dtype),
                 "accuracy_top3": best.any(-1).to(logits.dtype),
             }
-        result = TensorDict(
-            {
-                "loss_goal": self._reduced(nll, counted),
-                **{name: self._reduced(value, counted, reduction) for name, value in statistics.items()},
-            }
-        )
+        found = {name: self._reduced(value, counted, reduction) for name, value in statistics.items()}
+        result = TensorDict({"loss_goal": self._reduced(nll, counted), **found})
         self._clear_weakrefs(tensordict, result, "goal_network_params")
         return result
 

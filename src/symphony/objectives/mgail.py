@@ -42,6 +42,7 @@ class MGAILLoss(MaskedLoss):
         detach_keys: inputs of the actor through which no gradient flows back to earlier states. Without them
             gradients pass through the actor's reactions too.
         truncate: steps after which the gradient is cut; 0: never.
+        until_done: False if ends of episodes are to change nothing at all.
         reduction: `"mean"` or `"sum"` over entries that count, or `"none"`, `[..., T, N]`.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
@@ -61,7 +62,7 @@ class MGAILLoss(MaskedLoss):
             noise (NestedKey): numbers `[..., N, *]` that the actor draws by.
             plan (NestedKey): the same for all steps, `[..., T, N, *]`, optional in the start states.
             valid (NestedKey): bool `[..., N]`, True where an agent counts.
-            done (NestedKey): bool `[..., 1]`, True where the episode has ended.
+            done (NestedKey): bool `[..., 1]`, True where the episode has ended; `[..., N, 1]` where agents end apart.
         """
 
         score: NestedKey = ("agents", "score")
@@ -89,6 +90,7 @@ class MGAILLoss(MaskedLoss):
         cost: Cost = "log_d",
         detach_keys: Sequence[NestedKey] = (),
         truncate: int = 0,
+        until_done: bool = True,
         reduction: Reduction | None = None,
         use_mask: bool | None = None,
     ) -> None:
@@ -101,7 +103,7 @@ class MGAILLoss(MaskedLoss):
         self.convert_to_functional(actor_network, "actor_network")
         # Neither is trained here: in a container they are neither saved nor reset with the loss.
         self._held: dict[str, Any] = {"discriminator": discriminator, "env": env}
-        self.horizon, self.cost, self.truncate = horizon, cost, truncate
+        self.horizon, self.cost, self.truncate, self.until_done = horizon, cost, truncate, until_done
         self.detach_keys = [key for key in detach_keys if key in actor_network.in_keys]
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -144,7 +146,9 @@ class MGAILLoss(MaskedLoss):
         # Numbers left behind by an earlier policy would decide every step again.
         now = tensordict.exclude(self.tensor_keys.plan, self.tensor_keys.noise)
         # Called with tensors alone, the batch was guessed from them.
-        now.batch_size = done.shape[:-1]
+        spec = env.full_done_spec.get(self.tensor_keys.done, None)
+        own = 1 if spec is None else len(spec.shape) - len(env.batch_size)  # [1], or [N, 1]
+        now.batch_size = done.shape[: done.ndim - own]
         batch, start = now.batch_dims, now
         steps = self.horizon if plan is None else plan.shape[batch]
         if steps < 1:
@@ -153,12 +157,8 @@ class MGAILLoss(MaskedLoss):
         score, going = self._simulate(env, now, plan, steps)
         valid = self._counted(start, score.select(batch, 0).shape, done.device)
         counted = valid.unsqueeze(batch) & going
-        result = TensorDict(
-            {
-                "loss_mgail": self._reduced(COSTS[self.cost](score), counted),
-                "mgail_score": self._reduced(score.detach(), counted, "mean"),
-            }
-        )
+        loss, logit = self._reduced(COSTS[self.cost](score), counted), self._reduced(score.detach(), counted, "mean")
+        result = TensorDict({"loss_mgail": loss, "mgail_score": logit})
         self._clear_weakrefs(tensordict, result, "actor_network_params")
         return result
 
@@ -186,13 +186,13 @@ class MGAILLoss(MaskedLoss):
                 for key in env.action_keys:
                     drawn.set(key, acting.get(key))
                 # An environment may go on after an end, and a later state of it be invalid.
-                alive = alive & ~now.get(self.tensor_keys.done)
+                alive = alive & ~now.get(self.tensor_keys.done) if self.until_done else alive
                 now = env.step_mdp(env.step(drawn))
                 scored = functional_call(self.discriminator, frozen, (now.copy(),))
                 score = scored.get(self.tensor_keys.score, default=None)
                 if score is None:
                     raise KeyError(f"the discriminator writes no score under {self.tensor_keys.score!r}")
                 scores.append(score)
-                going.append(alive.reshape(alive.shape[:batch] + (1,) * (score.ndim - batch)))
+                going.append(alive.flatten(batch) if score.ndim > batch else alive.squeeze(-1))
         score = torch.stack(scores, batch)
         return score, torch.stack(going, batch).expand_as(score)
