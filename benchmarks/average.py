@@ -36,7 +36,7 @@ def average(run: Path, out: Path, folders: Sequence[Path]) -> Path:
 
 
 def main() -> None:
-    """Average and say where the result is."""
+    """Average the checkpoints and print where the result is."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("out", type=Path)

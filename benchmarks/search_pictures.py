@@ -107,7 +107,7 @@ def simulated(agent: Agent, segment: RunSegment, seed: int, *, back: bool) -> tu
 
 
 def draw_over_time(axes: Axes, steps: Steps, copies: Copies, dt: float, title: str) -> None:
-    """One row for each line; what it tried before it went back lies below it."""
+    """Draw a row for each line; what it tried before it went back lies below it."""
     high = max(attempt for _, attempt, *_ in steps) + 1
     for color, width, wanted in ((LOST, 1.0, False), (KEPT, 2.2, True)):
         rows = [(line + 0.7 * attempt / high, number) for line, attempt, number, good, _ in steps if good is wanted]

@@ -64,7 +64,7 @@ def _lives(process: int) -> bool:
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError, PermissionError) as error:
-        return isinstance(error, PermissionError)  # somebody else's
+        return isinstance(error, PermissionError)  # another user's process
     return True
 
 

@@ -185,7 +185,7 @@ class Agent:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Its networks by name."""
+        """The networks of the agent by their names."""
         parts = {"policy": self.policy, "goals": self.goals, "discriminator": self.discriminator}
         return {name: module for name, module in parts.items() if module is not None}
 

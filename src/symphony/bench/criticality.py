@@ -1,4 +1,4 @@
-"""How critical driving is for the ego: the hardest run segments of a store, or rollouts of a folder.
+"""The criticality of driving for the ego: the hardest run segments of a store, or rollouts of a folder.
 
 Sources: least time to collision (Hayward 1972), post-encroachment time (Allen, Shin and Cooper 1978).
 """

@@ -1,4 +1,4 @@
-"""How often a planner fails among learned agents, where that is rare: what leads to it is simulated more often.
+"""The rate of rare failures of a planner among learned agents: what leads to them is simulated more often.
 
 A particle filter (:class:`symphony.collectors.Systematic`) simulates the branches of a tree. Every :data:`PERIOD`
 those in which the ego comes near to a collision are copied and others dropped, with weights that make up for it: the

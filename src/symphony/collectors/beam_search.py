@@ -252,7 +252,7 @@ def _independent(
 
 @dataclass(frozen=True)
 class Simulation:
-    """How branches are simulated and scored; `whole` is the environment for all, [*b, S] of a `shape`."""
+    """The simulation and scoring of branches; `whole` is the environment for all, [*b, S] of a `shape`."""
 
     env: EnvBase
     whole: EnvBase

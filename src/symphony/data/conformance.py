@@ -1,7 +1,7 @@
 """Checks that a reader keeps its contract: :func:`check_reader`, for our readers and for others.
 
 :func:`~symphony.data.segment.validate` sees shapes and ranges only; speeds in miles per hour fit the schema as well.
-Here segments are looked at for what the schema means: units, frames, sides and directions, in numbers that are pooled
+Here segments are checked for what the schema means: units, frames, sides and directions, in numbers that are pooled
 over all segments given, so that a rare spike in a real log does not count.
 """
 

@@ -28,7 +28,7 @@ def joined(road: RoadMap) -> tuple[RoadMap, int]:
     first, last, inward, outward, known = _ends(road)
     if not known.any():
         return road, 0
-    # Shapely's index is flat; heights are looked at below. [E] pairs of an end's lane and a start's.
+    # Shapely's index is flat; heights are compared below. [E] pairs of an end's lane and a start's.
     tree = shapely.STRtree(shapely.points(first[:, :2]))
     end, start = tree.query(shapely.points(last[:, :2]), predicate="dwithin", distance=REACH)
     gap = np.linalg.norm(first[start] - last[end], axis=1)

@@ -20,7 +20,7 @@ from symphony.data.segment import Polylines, RunSegment
 LEVEL = 2.5  # metres of height from which on two things at one place are on different levels
 CELL = 5.0  # metres of the columns in which heights are compared
 RISE = 1.5  # metres by which a surface may rise from one column to a neighbour, two columns away at most
-SPACING = 2.0  # metres between the points at which the lines of a map are looked at, at most
+SPACING = 2.0  # metres between the points that stand for the lines of a map, at most
 NOWHERE = 99  # number of what is a level away from all lines at its place, as on a bridge the map lacks
 
 _NEAR = sorted(product(range(-2, 3), repeat=2), key=lambda way: way[0] ** 2 + way[1] ** 2)

@@ -132,7 +132,7 @@ class Polylines:
 
     @property
     def line_index(self) -> Ints:
-        """[P] the line each point belongs to."""
+        """The line [P] that each point belongs to."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
 
@@ -159,7 +159,7 @@ class RoadMap:
 
     @property
     def widths(self) -> NDArray[np.float64]:
-        """[L] metres, nominal ones where the source does not give them."""
+        """The widths of lanes [L] in metres, nominal ones where the source does not give them."""
         nominal = np.where(self.lane_type == LaneType.BIKE_LANE, 1.6, 3.6)
         return np.where(np.isnan(self.lane_width), nominal, self.lane_width)
 

@@ -147,17 +147,17 @@ class SegmentStore(Sequence[RunSegment]):
 
     @property
     def map_index(self) -> NDArray[np.int64]:
-        """[segments] which distinct map each segment lies on."""
+        """The distinct map that each segment lies on [segments]."""
         return self._segments["map"]
 
     @property
     def num_steps(self) -> NDArray[np.int64]:
-        """[segments] logged steps, the first included."""
+        """The number of logged steps of each segment [segments], the first included."""
         return self._segments["steps"].astype(np.int64)
 
     @property
     def time_steps(self) -> NDArray[np.float64]:
-        """[segments] seconds per step."""
+        """The seconds per step of each segment [segments]."""
         return self._segments["dt"].astype(np.float64)
 
     @cached_property
@@ -167,14 +167,14 @@ class SegmentStore(Sequence[RunSegment]):
 
     @cached_property
     def sources(self) -> NDArray[np.str_]:
-        """[segments] The :attr:`RunSegment.source` of each."""
+        """The :attr:`RunSegment.source` of each segment [segments]."""
         return np.array(self._texts("source"), np.str_)
 
     @cached_property
     def groups(self) -> NDArray[np.str_]:
-        """[segments] the recording each segment is part of: :attr:`RunSegment.group`.
+        """The recording [segments] that each segment is part of: :attr:`RunSegment.group`.
 
-        Its own id where the store does not know; the simulated network where an earlier release generated it.
+        It is the segment's id where the store does not know; the simulated network for stores of earlier releases.
         """
         tags = (self._parsed(i, text) for i, text in enumerate(self._texts("tags")))
         return np.array([_group(*each) for each in zip(tags, self.ids, strict=True)], np.str_)

@@ -143,7 +143,7 @@ def check_header(folder: Path) -> None:
     if not path.is_file():
         message = f"not a segment store: it has no {HEADER}" if folder.exists() else "no such directory"
         if folder.name and folder.with_name(folder.name + PARTIAL).is_dir():
-            message += "; there is an unfinished conversion to that name: its command goes on with it"
+            message += "; there is an unfinished conversion to that name: its command continues it"
         raise DataError(message, file=folder)
     found = read_json(path)
     if found != header():

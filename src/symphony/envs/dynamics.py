@@ -1,5 +1,5 @@
-"""How an agent moves: kinematic bicycle with discrete actions, and continuous displacement; and policies that need no
-learning.
+"""Models of an agent's motion: kinematic bicycle with discrete actions, and continuous displacement; and policies
+that need no learning.
 
 State: x, y, heading, speed of the box centre (metres, radians, m/s). Everything is differentiable and out of
 place. Shapes: ``...`` any batch, T steps.

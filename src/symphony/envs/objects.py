@@ -25,7 +25,7 @@ FORESEEN, LONGER = (0.5, 1.0), (1.5, 2.0)
 """Seconds ahead at which an entering agent's box must meet no other if all keep speed and course, and more of them
 past the log."""
 HEADWAY = (0.25, 0.5, 0.75, 1.0)  # seconds for which that one could go on if all others stood
-_PLACES = 1 << 22  # positions times logged steps that are looked at together
+_PLACES = 1 << 22  # positions times logged steps that are processed together
 
 
 class Objects(NamedTuple):

@@ -204,7 +204,7 @@ def nearest_points(
     mask = tables.scenes.point_valid.flatten()[flat]
     rest = torch.from_numpy(cell < 0)
     if level is not None:
-        # Cells do not know of levels: where one of the nearest is on another, all are looked at.
+        # Cells do not know of levels: where one of the nearest is on another, all are searched.
         rest |= levels_apart(tables.scenes.point_height.flatten(0, 1)[flat], level).any(1)
     for some in rest.nonzero().squeeze(-1).split(max(_DISTANCES // total, 1)):
         found = _among_all(tables, row[some], here[some, None], None if level is None else level[some])

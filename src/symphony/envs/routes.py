@@ -35,7 +35,7 @@ AHEAD = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20, 27)
 ROUTE_FEATURES = 4 + 3 * (len(AHEAD) - 1)
 ALONG_FEATURES = 11
 BESIDE = 20.0  # metres beside its route within which an agent sees where along it something is
-STRIDE = 4  # of the points of a route, the share (one in so many) by which the goal policy observes it
+STRIDE = 4  # the goal policy observes every STRIDE-th point of a route
 CHOICE_FEATURES = 5 * (POINTS // STRIDE)
 TURN_FEATURES = 2 + (POINTS - 2)
 """Where a route begins, and a turn at each of its points but the first and the last."""
@@ -183,7 +183,7 @@ class Routes(NamedTuple):
 
 
 class FollowedRoutes(NamedTuple):
-    """Some routes, such as the one that each agent follows; leading dimensions [*b], such as [M, N]."""
+    """Routes such as the one that each agent follows; leading dimensions [*b], such as [M, N]."""
 
     point: Tensor  # [Q, 2] points of many routes
     begin: Tensor  # [*b] int64 place of the first point of each

@@ -466,7 +466,7 @@ class Tables:
 
     @cached_property
     def agents(self) -> Float[Tensor, "BA 7"]:
-        """[B * A, 7] size and kind of agents as they are seen."""
+        """The size and kind of agents as they are seen [B * A, 7]."""
         scenes = self.scenes
         size = scenes.box_size.flatten(0, 1) / self.config.size_scale
         rows = size.new_zeros(len(size), AGENT_FEATURES)

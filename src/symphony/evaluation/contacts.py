@@ -29,7 +29,7 @@ from symphony.metrics.kinds import STANDING, kind_of_contact
 from symphony.saved.rollouts import World
 
 STILL = 0.05  # speed in m/s up to which an agent that is hit has stopped, so that nothing is its fault (as in nuPlan)
-HORIZON = 5.0  # seconds ahead that a collision is looked for
+HORIZON = 5.0  # seconds ahead within which a collision is sought
 RED_SECONDS = 5.0  # for which an agent that ran a red light is at fault for meeting others across
 CUT_IN_SECONDS = 4.0  # before a contact in which a lane change may have caused it
 RESPONSE, SPEED_UP, BRAKE_LEAST, BRAKE_MOST = 1.0, 3.5, 4.0, 8.0

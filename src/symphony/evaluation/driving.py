@@ -1,4 +1,4 @@
-"""How single rollouts drive: red lights, wrong way, blocking traffic, progress, comfort, distance to the log.
+"""The driving in single rollouts: red lights, wrong way, blocking traffic, progress, comfort, distance to the log.
 
 Metres, radians, seconds. Legend: A agents, U states, T = U - 1 steps, M evaluated agents, Q lights, E moments.
 """
@@ -37,7 +37,7 @@ WRONG_WAY = 2 * math.pi / 3  # smallest angle between an agent and a lane that i
 IN_LANE = 2.0  # metres from a centre line within which an agent is in the lane
 PAST_END = 5.0  # metres from the end of a route beyond which an agent has gone on
 SECONDS = 3.0  # for which an agent must stand on a free road to block it
-FREE = 15.0  # metres ahead of the front that nobody is in and no light that is not green
+FREE = 15.0  # metres ahead of the front without other agents and without a light other than green
 CROSSING = 25.0  # metres within which others that move across are given way to
 ASIDE = 0.5  # metres beside its box that an agent wants to be free
 _FOLLOWED = 3.0  # metres from a centre line, on average, within which a path follows the lane
@@ -67,7 +67,7 @@ class Lanes:
 
     @cached_property
     def light_height(self) -> NDArray[np.float32]:
-        """[Q, 2] height and level of the lights, taken from their lanes."""
+        """The height and level of the lights [Q, 2], taken from their lanes."""
         place = np.zeros((len(self.segment.signal_lane), 3))
         for light, lane in enumerate(self.segment.signal_lane.tolist()):
             line = self.segment.road.lanes[lane]

@@ -26,14 +26,14 @@ Bools = NDArray[np.bool_]
 
 POINT_CELL = 8.0  # metres of a cell's side, for points
 EDGE_CELL = 4.0  # metres of a cell's side, for the edges of the road
-ROWS = 64  # positions whose candidates are looked at together, so that they stay in the cache
+ROWS = 64  # positions whose candidates are processed together, so that they stay in the cache
 
 _MARGIN = 8.0  # metres of cells beyond the outermost element
 _SLACK = 0.02  # metres by which lists reach farther than they need to, far above the rounding of float32
 _CELLS = 1 << 14  # most cells of a map; larger maps get larger cells
 _BLOCK = 1 << 17  # distances held at a time while lists are made
 _MANY = 256  # neighbours above which most of them lie far away, where the size of a cell matters less
-_WORTH = 3  # elements of a map for each that is looked for, below which a list saves nothing
+_WORTH = 3  # elements of a map for each wanted one, below which a list saves nothing
 _FILLING = Lock()
 
 

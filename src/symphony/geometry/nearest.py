@@ -51,7 +51,7 @@ def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
     if not np.isfinite(cut).all():
         values, cut = (np.where(np.isnan(part), np.inf, part) for part in (values, cut))
     chosen = values <= cut
-    # Ties are rare: only then rows are looked at one by one.
+    # Ties are rare: only then rows are handled one by one.
     if np.count_nonzero(chosen) != count * len(values):
         odd = np.flatnonzero(np.count_nonzero(chosen, axis=1) != count)
         less, equal = values[odd] < cut[odd], values[odd] == cut[odd]

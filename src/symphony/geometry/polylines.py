@@ -225,7 +225,7 @@ Reals = NDArray[np.float64]
 
 NEAR = 1.0
 """Metres by which an earlier pass may be farther away than the nearest and is still where a path begins."""
-_SLACK = 3.0  # metres along the line, besides the way driven, within which the next place is looked for
+_SLACK = 3.0  # metres along the line, besides the distance driven, within which the next place is sought
 _CUT = 1.5  # metres along the line to a metre driven: cutting a corner is faster
 _TOGETHER = 1 << 15  # distances of points to pieces that are found together
 

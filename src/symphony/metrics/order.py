@@ -1,4 +1,4 @@
-"""Who goes first between agents whose paths merge or cross (see :func:`symphony.data.selection.relations`).
+"""The passing order of agents whose paths merge or cross (see :func:`symphony.data.selection.relations`).
 
 Metres and seconds.
 """
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 REACH = 1.5  # metres within which two paths are at the same place, about half a lane
-_FINER = 4  # parts of a step at which paths are looked at: in a whole one a vehicle may jump over the place
+_FINER = 4  # parts of a step at which paths are compared: in a whole one a vehicle may jump over the place
 
 
 def passing_gap(
@@ -61,7 +61,7 @@ def _finer(
 
 @dataclass(frozen=True)
 class OrderStatistics:
-    """How rollouts keep the order in which K pairs of agents pass, NaN where there is nothing to count."""
+    """The order in which K pairs of agents pass in rollouts, NaN where there is nothing to count."""
 
     pairs: int  # that meet in the log, one after the other
     kept: float  # share of their rollouts in which the same one goes first

@@ -15,7 +15,7 @@ from torch import Tensor
 from symphony.geometry import contact_share, levels_apart
 
 _SLACK = 1e-3
-_PAIRS = 1 << 22  # pairs of agents, times states, looked at together: more would not stay in the cache
+_PAIRS = 1 << 22  # pairs of agents, times states, processed together: more would not stay in the cache
 
 
 class Meetings(NamedTuple):

@@ -35,7 +35,7 @@ class ElementGroup:
 
 
 def mlp(sizes: Sequence[int]) -> nn.Sequential:
-    """Linear layers of the given widths (input first) with ReLU between them and none after the last."""
+    """Return linear layers of the given widths (input first) with ReLU between them and none after the last."""
     if len(sizes) < 2:
         raise ValueError(f"a network needs an input and an output width, got {tuple(sizes)}")
     layers: list[nn.Module] = []

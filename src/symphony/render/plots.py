@@ -119,13 +119,13 @@ class Clip:
 
     @property
     def log(self) -> NDArray[Any]:
-        """[N, T, 2] where the agents were in the log, NaN where they were not."""
+        """The places [N, T, 2] of the agents in the log, NaN where there are none."""
         position = self.segment.position[self.agents, self.steps, :2]
         return np.where(self.segment.valid[self.agents, self.steps, None], position, np.nan)
 
     @property
     def points(self) -> NDArray[Any]:
-        """[P, 2] where the agents are in the rollouts and in the log."""
+        """The places [P, 2] of the agents in the rollouts and in the log."""
         return np.concatenate([self.position[self.valid], self.log.reshape(-1, 2)])
 
     @property
@@ -135,7 +135,7 @@ class Clip:
 
     @property
     def alpha(self) -> float:
-        """How opaque one of the rollouts is drawn."""
+        """The opacity of one rollout in the picture."""
         return float(np.clip(2.5 / len(self.position), 0.3, 0.9))
 
     def words(self) -> str:

@@ -54,7 +54,7 @@ def _settings(env: DrivingEnv, rule: PruningRule | Backtrack, also: Sequence[Any
         # A copy takes the random numbers of the place it lands in, so that forks part.
         "slot_keys": (keys.STREAM,),
         "group_key": keys.GOAL if takes_groups(rule) else None,
-        # Of every step enough to observe its states anew.
+        # Of every step enough to observe its states again.
         "keep": [*_KEPT, *waiting, *also],
     }
 

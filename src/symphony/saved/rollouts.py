@@ -91,7 +91,7 @@ class SavedRollouts:
 
     @property
     def there(self) -> NDArray[np.bool_]:
-        """[K, T + 1, N] who is present at each state: at the first if the second counts and the log has them."""
+        """The agents present at each state [K, T + 1, N]: at the first if the second counts and the log has them."""
         first = self.counted[:, :1] & self.segment.valid[self.agents, self.start]
         return np.concatenate([first, self.counted], 1)
 
@@ -141,7 +141,7 @@ class World(NamedTuple):
 
     @property
     def speed(self) -> NDArray[np.float64]:
-        """[A, U] along the heading, negative when reversing."""
+        """The speed along the heading [A, U], negative when reversing."""
         return self.velocity[..., 0] * np.cos(self.heading) + self.velocity[..., 1] * np.sin(self.heading)
 
 

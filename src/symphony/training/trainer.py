@@ -243,7 +243,7 @@ class Trainer:
             if self.world.is_main:
                 self._lock = held.enter_context(Lock(self.config.out / LOCK))
                 if checkpoint_to_resume(self.config) != self.done:
-                    raise ConfigError(f"{self.config.out}: another process went on with this run meanwhile")
+                    raise ConfigError(f"{self.config.out}: another process has continued this run meanwhile")
             return self._run()
 
     def _run(self) -> Path:

@@ -120,7 +120,7 @@ def log_playback(window: RunSegment) -> SimulatedRollouts:
     return SimulatedRollouts(window.agent_id[rows], *np.moveaxis(np.repeat(states[None], ROLLOUTS, 0), -1, 0))
 
 
-EVERY = 2  # steps of 0.1 s between those at which paths are looked at
+EVERY = 2  # steps of 0.1 s between those at which paths are compared
 
 
 class PassingGaps(NamedTuple):

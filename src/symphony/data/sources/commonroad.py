@@ -267,7 +267,7 @@ class _Lanelet:
 
     @property
     def ring(self) -> Doubles:
-        """Its closed outline [2 P + 1, 2]."""
+        """The closed outline of the lanelet [2 P + 1, 2]."""
         return np.concatenate([self.left, self.right[::-1], self.left[:1]])
 
 

@@ -261,7 +261,7 @@ def from_positions(state: Doubles, valid: Bools, dt: float) -> Doubles:
 
     Headings that are far off the motion become NaN, which :func:`headings` fills. They are compared with the motion
     at the nearest step at which the agent moves: trackers give 0 to what stands before it moves. An agent that never
-    moves keeps what was logged; driving backwards can't be told.
+    moves keeps what was logged; driving backwards can't be recognised.
     """
     # The line reaches over 4 sigma: at least to the next step.
     _, slope, _ = local_line(state[..., :2], valid, dt, max(SIGMA, dt / 4))

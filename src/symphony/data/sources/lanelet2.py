@@ -85,7 +85,7 @@ class Lanelet:
 
     @property
     def ring(self) -> Doubles:
-        """Its closed outline [P, 2]."""
+        """The closed outline of the lanelet [P, 2]."""
         return np.concatenate([self.left.line, self.right.line[::-1], self.left.line[:1]])
 
     @property
@@ -106,7 +106,7 @@ Rules = Mapping[int, tuple[Tags, Sequence[Way]]]
 
 @dataclass(frozen=True)
 class LaneletMap:
-    """Everything read from a file, in metres; lanelets, ways and areas in file order.
+    """The content of a file, in metres; lanelets, ways and areas in file order.
 
     ``odd`` says what was left out, as a map that was cut out of a larger one lacks some of it: kind -> example.
     """

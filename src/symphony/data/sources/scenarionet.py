@@ -38,7 +38,7 @@ from symphony.errors import DataError
 MEETS = 0.5  # metres within which a lane's end meets another's start
 TURN = np.deg2rad(60)  # largest angle between the two there
 HALF_WIDTH = 1.75  # metres on either side of a centre line that are drivable where the map has no area
-MAX_WIDTH = 20.0  # metres on either side of a line in which the edge of its area is looked for
+MAX_WIDTH = 20.0  # metres on either side of a line in which the edge of its area is sought
 BESIDE = (2.0, 5.5)  # metres between the centre lines of neighbours
 
 _STATE = {"valid": 1, "position": 3, "heading": 1, "velocity": 2, "length": 1, "width": 1, "height": 1}

@@ -16,7 +16,7 @@ FAR_AHEAD = 5.0  # greatest time to collision, seconds
 SAME_WAY, NEARLY_SAME_WAY = math.radians(75.0), math.radians(10.0)
 """Heading differences up to which an object ahead is followed, and one that overlaps little sideways."""
 LITTLE_OVERLAP = 0.5  # metres of sideways overlap that are little
-_PAIRS = 1 << 20  # pairs of an object and another one, per step, looked at together
+_PAIRS = 1 << 20  # pairs of an object and another one, per step, processed together
 _SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 _BY_TURNS = ([0, 1, 1, 2, 2, 3, 3, 0], [0, 0, 1, 1, 2, 2, 3, 3])
 """Corners of either rectangle that each corner of the octagon of :func:`rectangle_gap` is made of."""

@@ -18,7 +18,7 @@ NOWHERE = -1e10  # distance, in metres, of an object that is not valid
 STRETCH = 3.0  # weight of height in choosing the nearest edge, so that one on another level is not taken
 CLOSED = 1.0  # square metres between the ends of a line below which it is closed
 _CELL = 1.0  # metres. A choice of speed, as is the next one: results don't depend on them.
-_TOGETHER = 1 << 16  # points looked at together
+_TOGETHER = 1 << 16  # points processed together
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,8 @@ __all__ = ["KINDS", "CropRule", "crop_rule", "generate_run", "is_own", "kind_nam
 
 KINDS = tuple(NETWORKS)  # kinds of network that generate_run knows
 WARM_UP = 30.0  # simulated seconds before the first segment starts, at least
-_OWN = 4  # number of roads of one's own among the kinds
-_OWN_FILLS = 3  # times as long a warm-up for roads of one's own, which may be larger
+_OWN = 4  # number of the user's own roads among the kinds
+_OWN_FILLS = 3  # times as long a warm-up for the user's own roads, which may be larger
 SUBLANE_SHARE = 1 / 3
 _SLOW = 10.0  # m/s at which a longer freeway fills during a longer warm-up
 
@@ -46,7 +46,7 @@ def generate_run(
     takes; its stop point is the end of the lane before. Equal arguments give equal segments. Segments of one focus
     share one map object.
 
-    A kind is one of :data:`KINDS`, or a file of roads of one's own (:data:`.networks.OWN_ROADS`); another seed is
+    A kind is one of :data:`KINDS`, or a file of your own roads (:data:`.networks.OWN_ROADS`); another seed is
     another network. ``duration`` is what is recorded, in seconds, after a warm-up. ``rule`` says how maps and egos
     are chosen, and how long segments are; by default the kind's own for 10 s. At a junction a route is ``straight``
     times as likely to go straight on as to take any one turn. A :class:`ConfigError` says what is wrong with an
@@ -73,7 +73,7 @@ def generate_run(
             raise DataError("has no roads for cars", file=Path(kind))
         if own:
             slow_bends(file)
-        # On roads of one's own traffic comes from where streets begin at the edge of the map, and circulates.
+        # On the user's own roads traffic comes from where streets begin at the edge of the map, and circulates.
         through, around = ramp or (own and bool(network.sources())), not ramp
         sublane = bool(drive_rng.random() < SUBLANE_SHARE)
         warm_up = WARM_UP * (_OWN_FILLS if own else 1) + longer / _SLOW

@@ -28,7 +28,7 @@ _TURN, _NEAR, _SPEED_CHANGE = 0.5, 6.0, 4.0
 
 @dataclass(frozen=True)
 class CropRule:
-    """How maps and egos are chosen; distances in metres."""
+    """The choice of maps and egos; distances in metres."""
 
     radius: float = 110.0  # around the focus, that the map covers
     ego_radius: float = 78.0  # within which the ego stays throughout, so that road lies ahead of it
