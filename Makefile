@@ -1,7 +1,7 @@
 # Every target sets itself up: a machine with Python 3.11 or newer and make needs nothing else.
 VENV ?= .venv
 BIN := $(VENV)/bin
-# Looked for when it is first needed, and then no more.
+# Sought when it is first needed, and only once.
 PYTHON ?= $(eval PYTHON := $(shell for python in python3.11 python3; do \
 	$$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$python && break; done))$(PYTHON)
 
@@ -12,19 +12,19 @@ CORE := $(VENV)/.core
 DEV := $(VENV)/.dev
 CONSTRAINTS ?= constraints.txt
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS)
-# All there are, so that no test is skipped for want of one.
+# All of them, so that no test is skipped for lack of one.
 EXTRAS := dev,docs,argoverse2,ray,sumo,gym,video,mcap
 SPELLED := src tests recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md SECURITY.md
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo picture table test test-lowest fuzz kills flat mutate coverage audit bench lint format docs clean
 
-help:  ## what there is
+help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-12s %s\n", $$1, $$2}'
 
 setup: $(DEV)  ## create .venv with everything for development
 
-demo: $(CORE)  ## an included agent, then one learned from the built-in data: pictures and numbers in out/demo
+demo: $(CORE)  ## an included agent, then one trained on the built-in data: pictures and numbers in out/demo
 	$(BIN)/symphony demo --out out/demo
 
 PICTURE := sumo-town-001000-f0-w11-v5 sumo-town-001000-f2-w03-v10 sumo-town-001005-f0-w05-v13
@@ -44,12 +44,12 @@ test: $(DEV)  ## run the tests, in a process per core
 
 FUZZ_ARGS ?= --inputs 2000
 
-fuzz: $(DEV)  ## feed damaged files to everything that reads files; goes on where it stopped
+fuzz: $(DEV)  ## feed damaged files to everything that reads files; continue where it stopped
 	OMP_NUM_THREADS=1 nice $(BIN)/python tests/tools/fuzz.py $(FUZZ_ARGS)
 
 KILLS_ARGS ?= --kills 30
 
-kills: $(DEV)  ## kill everything that writes at random moments, go on, and compare with undisturbed work
+kills: $(DEV)  ## kill everything that writes at random moments, resume, and compare with undisturbed work
 	OMP_NUM_THREADS=1 nice $(BIN)/python tests/tools/kills.py $(KILLS_ARGS)
 
 MUTATE_ARGS ?= --changes 10
@@ -58,12 +58,12 @@ mutate: $(DEV)  ## change operators in what computes; tell which changes no test
 	OMP_NUM_THREADS=1 nice $(BIN)/python tests/tools/mutate.py $(MUTATE_ARGS)
 
 # Not among the development packages, as nothing else needs it; processes of their own are not counted.
-coverage: $(DEV)  ## run the tests in one process and say which branches of src they take; slow
+coverage: $(DEV)  ## run the tests in one process and report which branches of src they take; slow
 	$(INSTALL) 'coverage>=7.6'
 	OMP_NUM_THREADS=1 $(BIN)/python -m coverage run --branch --source=src/symphony -m pytest -q
 	$(BIN)/python -m coverage report --skip-covered --sort=cover
 
-flat: $(DEV)  ## train and evaluate for long and tell whether memory and open files grow
+flat: $(DEV)  ## train and evaluate for long and report whether memory and open files grow
 	OMP_NUM_THREADS=1 nice $(BIN)/python tests/tools/flat.py
 
 audit: $(DEV)  ## ask a public database for known vulnerabilities of the pinned packages
@@ -85,7 +85,7 @@ lint: $(DEV)  ## style, docstrings, spelling, types, imports between packages, l
 
 BENCH_ARGS ?=
 
-bench: $(DEV)  ## speed of everything, by part and as it grows, in CPU time of one thread; some minutes
+bench: $(DEV)  ## speed of everything, by part and as it grows, in CPU time of one thread; a few minutes
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/measure.py --out out/bench.json $(BENCH_ARGS)
 	$(BIN)/python benchmarks/tables.py out/bench.json
 

@@ -133,7 +133,7 @@ def test_the_command_finds_the_rate_of_free_rollouts_and_keeps_what_shows_it(sto
     # What was picked is no sample of anything.
     for command in (["report", str(out)], ["planners", str(tmp_path / "free"), str(out)]):
         assert main(command) == 1
-        assert "count nothing" in capsys.readouterr().err
+        assert "give no rates" in capsys.readouterr().err
     assert main(["view", str(out)]) == 0
 
 
@@ -141,7 +141,7 @@ def test_the_command_finds_the_rate_of_free_rollouts_and_keeps_what_shows_it(sto
 def test_where_nothing_is_random_there_is_nothing_to_hunt(words, tmp_path, capsys):
     command = f"hunt {words} --planner log --data {builtin_store('test')} --segments 0 --out {tmp_path}"
     assert main(command.split()) == 1
-    assert "one run of each segment says it all" in capsys.readouterr().err
+    assert "one run of each segment is enough" in capsys.readouterr().err
 
 
 def test_what_a_rate_is_worth_is_said():

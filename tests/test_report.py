@@ -252,7 +252,7 @@ def test_the_command_writes_page_numbers_and_table(tmp_path, capsys):
     written = sorted(path.name for path in (tmp_path / "other").iterdir())
     assert written == ["report.csv", "report.html", "report.json"]
     assert main(["report", str(tmp_path / "nothing")]) == 1
-    assert "no folder of rollouts" in capsys.readouterr().err
+    assert "not a folder of rollouts" in capsys.readouterr().err
 
 
 SCRIPT = load_script("relations")

@@ -123,7 +123,7 @@ def test_another_simulation_or_folder_is_refused(tmp_path):
     (tmp_path / "shop" / "index.jsonl").write_text("")
     (tmp_path / "shop" / "rollouts.lock").touch()  # left by a writer that was killed before its manifest
     RolloutWriter(tmp_path / "shop", ABOUT).close()
-    with pytest.raises(DataError, match="no folder of rollouts"):
+    with pytest.raises(DataError, match="not a folder of rollouts"):
         load_rollouts(tmp_path / "other")
 
 

@@ -398,7 +398,7 @@ def test_an_index_that_was_cut_short_is_recognised(filled: Path) -> None:
 
 def test_the_command_verifies(filled: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["data", "verify", str(filled)]) == 0
-    assert "3 segments are what was written" in capsys.readouterr().out
+    assert "3 segments are as they were written" in capsys.readouterr().out
     change(filled / "columns" / "heading.bin", 0, np.float32(1.25).tobytes())
     assert main(["data", "verify", str(filled)]) == 1
     found = capsys.readouterr().err

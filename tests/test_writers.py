@@ -62,7 +62,7 @@ def test_one_that_died_before_it_had_begun(tmp_path: Path) -> None:
     for held in (False, True):
         if held:
             (tmp_path / "own" / "rollouts.lock").touch()
-        with pytest.raises(DataError, match="no folder of rollouts"):
+        with pytest.raises(DataError, match="not a folder of rollouts"):
             RolloutWriter(tmp_path / "own", about)
 
 

@@ -235,7 +235,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise refused("damaged: its checksum differs from the recorded one", "sha256")
     step, parts = manifest.get("step"), manifest.get("parts")
     if type(step) is not int or not 0 <= step < 10**12:
-        raise refused(f"no number of updates: {str(step)[:40]!r}", "step")
+        raise refused(f"not a number of updates: {str(step)[:40]!r}", "step")
     named = _NAME.fullmatch(path.name.removeprefix(".old-"))
     if named and int(named[1]) != step:
         raise refused(f"is {step} in the folder {path.name}", "step")
@@ -262,7 +262,7 @@ def _read_part(path: Path, manifest: dict[str, Any], part: str) -> dict[str, Any
             tensors = decode_tensors(content)
         state = decode(entry["state"], tensors)
         if not isinstance(state, dict):
-            raise TypeError("no table of values")
+            raise TypeError("not a table of values")
     except OSError as error:
         raise CheckpointError(f"can't be read: {error.strerror}", file=file, field=part) from error
     except CheckpointError:

@@ -158,7 +158,7 @@ def hunt(path: Path, hunter: Hunt, progress: Callable[[int, int], None] | None =
     alone = (config.interactive or agent.interactive) == 1
     if alone or agent.policy is None or agent.rule or isinstance(agent.policy, ConstantVelocity):
         what = "only the ego is driven" if alone else f"{agent.name} draws nothing at random"
-        raise ConfigError(f"{what}: one run of each segment says it all")
+        raise ConfigError(f"{what}: one run of each segment is enough")
     search: dict[str, Any] = {"search": "tree", "score": "flags", "rule": f"{__name__}:resampling"}
     search |= {"goals": "branch", "prune_every": max(1, round(PERIOD / data.segment(0).dt))}
     config = replace(config, **search, rollouts=config.trees * config.branches)
@@ -184,7 +184,7 @@ def hunt(path: Path, hunter: Hunt, progress: Callable[[int, int], None] | None =
     if not found:
         raise ConfigError("the ego of no run segment can be driven")
     if all(one.failed for one in found):
-        raise AllFailedError(f"{name} {found[0].failed}; so everywhere: metric failed_rate counts such runs")
+        raise AllFailedError(f"{name} {found[0].failed}, as in all segments: metric failed_rate counts such runs")
     known = [one for one in found if not math.isnan(one.rate)]
     seen = [one for one in known if one.rate > 0]
     mean = sum(one.rate for one in seen) / len(known) if known else math.nan

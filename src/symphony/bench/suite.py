@@ -124,7 +124,7 @@ def read_suite(path: Path, **shared: Any) -> Suite:
         text = path.read_text(encoding="utf-8")
         plain = tomllib.loads(text)
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"{path}: no TOML: {error}") from error
+        raise ConfigError(f"{path}: not TOML: {error}") from error
     file = _File(path, text.splitlines())
     for name in plain:
         if name not in _KEYS:
@@ -241,7 +241,7 @@ def _distinct(tables: list[_Table], given: Iterable[N]) -> tuple[N, ...]:
     found: list[N] = []
     for table, one in zip(tables, given, strict=True):
         if one.name in [other.name for other in found]:
-            raise table.wrong("name", f"{one.name!r} is there twice")
+            raise table.wrong("name", f"{one.name!r} is given twice")
         found.append(one)
     return tuple(found)
 

@@ -169,7 +169,7 @@ class Agents(shared.Command):
 class Demo(shared.Command):
     """Evaluate and draw an agent that comes with the package, on the built-in data: half a minute on a laptop.
 
-    Then train another on the built-in data, which takes some minutes, and show it beside the first.
+    Then train another on the built-in data, which takes a few minutes, and show it beside the first.
     """
 
     out: Path = Path("out/demo")  # Folder for agent, pictures, numbers; an earlier demo there is replaced.
@@ -207,7 +207,7 @@ class Demo(shared.Command):
 
         shared.say("An included agent, on segments that it has not seen, with its search:")
         show({**BASELINES, "included BC+TS+H": "pretrained:bc_ts_h"}, self.out / "included.png")
-        shared.say(f"\nNow one of your own: BC with goals (BC+H), {self.steps} updates, some minutes.")
+        shared.say(f"\nNow one of your own: BC with goals (BC+H), {self.steps} updates, a few minutes.")
         if (run / "config.json").is_file():
             shutil.rmtree(run)
         # Cheaper updates than by default suit the few segments of the package; so do inputs beyond the paper's, and

@@ -270,4 +270,4 @@ class Verify(shared.Command):
             store.verify(advance)
         found = {"path": str(store.path), "segments": len(store), "checksum": store.checksum()}
         if shared.write_numbers(self.json, found):
-            shared.say(f"{len(store)} segments are what was written; checksum {found['checksum']}")
+            shared.say(f"{len(store)} segments are as they were written; checksum {found['checksum']}")

@@ -90,7 +90,7 @@ class Hunt(shared.Command):
 
     Traffic in which the ego comes near to a collision is simulated more often, and weighs less in turn, so that the
     estimate has no bias. It holds for these run segments alone; its error is one standard error over trees. Some runs
-    that show the failure are kept: see them with `symphony view`.
+    that show the failure are kept: view them with `symphony view`.
     """
 
     #: Learned agent that drives the others: folder of a run (see `symphony train`), or `pretrained:NAME`.
@@ -133,6 +133,6 @@ class Hunt(shared.Command):
                 rows.append([one.segment or f"mean of {known}", *told, trees, str(one.kept)])
             shared.print_table(rows, heads=1)
             if found[-1].kept:
-                shared.say(f"see them: symphony view {self.out}")
+                shared.say(f"view them: symphony view {self.out}")
         for remark in rare.remarks(found):
             shared.tell(remark)

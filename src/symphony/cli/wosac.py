@@ -140,6 +140,6 @@ class Validate(shared.Command):
             shared.tell(str(problem))
         if report.problems:
             raise errors.DataError(f"{len(report.problems)} problems", file=self.submission)
-        shared.say(f"{len(report.scenarios)} scenarios in {len(report.shards)} shards, all well")
+        shared.say(f"{len(report.scenarios)} scenarios in {len(report.shards)} shards, no problems found")
         if required is None:
-            shared.say("Not checked, for want of --scenario: whether scenarios and agents are the right ones")
+            shared.say("Not checked without --scenario: whether scenarios and agents are the right ones")

@@ -324,7 +324,7 @@ class Pruning:
         self.weighs = rule if isinstance(rule, Resampling) else None
         self._groups = None if group_key is None else _groups(start, group_key)
         if group_key is not None and not takes_groups(rule):
-            raise ValueError(f"{rule} knows nothing of groups: group_key is for a rule that takes groups")
+            raise ValueError(f"{rule} takes no groups: group_key is for a rule that takes groups")
         self._noises: Sequence[Tensor | None] = [None] * periods
         if noise is not None:
             slots = start.shape[-1:] if getattr(rule, "noise_per_slot", False) else ()

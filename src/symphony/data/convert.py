@@ -439,7 +439,7 @@ def merge(paths: Sequence[Path], out: Path, progress: Told | None = None) -> Seg
     steps = {float(dt) for store in stores for dt in store.time_steps}
     if len(steps) > 1:
         listed = ", ".join(f"{dt:g} s" for dt in sorted(steps))
-        raise DataError(f"stores with different time steps don't go together: {listed}", file=paths[0])
+        raise DataError(f"stores with different time steps can't be merged: {listed}", file=paths[0])
     if read_job(folder_of(out)) is not None:
         raise DataError(f"an unfinished conversion to that name lies in {folder_of(out)}", file=out)
     draft = out.with_name(f"{out.name}.merging")

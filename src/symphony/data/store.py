@@ -214,7 +214,7 @@ class SegmentStore(Sequence[RunSegment]):
         try:
             found = json.loads((tags if isinstance(tags, str) else self._text(tags, row, "tags")) or "{}")
             if not isinstance(found, dict):
-                raise ValueError("no object")
+                raise ValueError("not an object")
         except (ValueError, RecursionError) as error:
             name = self.ids[row]
             raise DataError(f"not JSON: {error}", file=self.path, segment=name, field="tags") from error

@@ -136,7 +136,7 @@ def check_crowds(records: Sequence[Record]) -> None:
         differing += [] if _scores(one).keys() & _scores(other).keys() else ["all segments"]
         if differing:
             both = f"{planner_title(other)} and {planner_title(one)} did not meet the same crowd"
-            raise ConfigError(f"{both}: {', '.join(differing)} differ; compare them apart")
+            raise ConfigError(f"{both}: {', '.join(differing)} differ; compare them separately")
 
 
 def _scores(record: Record) -> dict[str, float | None]:

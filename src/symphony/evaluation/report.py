@@ -128,7 +128,7 @@ def report(
     is called with the segments done and their total.
     """
     if not picked and "hunt" in folder.about.settings:
-        raise DataError("`symphony hunt` picked runs that fail: see them, count nothing", file=folder.path)
+        raise DataError("`symphony hunt` picked runs that fail: view them, they give no rates", file=folder.path)
     found = Report(folder.about.agent, evaluated)
     for number, saved in enumerate(folder):
         add_segment(found, saved)

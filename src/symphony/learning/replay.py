@@ -95,7 +95,7 @@ class SearchReplay:
     def leaves(self) -> TensorDictBase:
         """The leaves [B, S, T] of the last search, with the tree in their entry ``tree``."""
         if self._leaves is None:
-            raise RuntimeError("nothing was searched yet")
+            raise RuntimeError("no search was made yet")
         return self._leaves
 
     def survivors(self, count: int, rng: torch.Generator, observation: ObservationConfig) -> TensorDict:

@@ -203,7 +203,7 @@ def _acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfi
     """Return a policy with a configuration's changes to its draws and the rule that drives background agents."""
     if config.action_temperature != 1.0:
         if keys.LOGITS not in policy.out_keys or not env.dynamics.discrete:
-            raise ConfigError("action-temperature means nothing to this agent: it draws no discrete actions")
+            raise ConfigError("action-temperature has no effect on this agent: it draws no discrete actions")
         policy = TensorDictSequential(policy, tempered(config.action_temperature))
     return TensorDictSequential(policy, RULES[config.others](env)) if config.others in RULES else policy
 
@@ -226,7 +226,7 @@ def _check_given(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given
         return
     follows = scenes.background & (config.others == "idm")
     if bool(((given.to(follows.device) >= 0) & ~follows).any()):
-        raise ConfigError(f"{agent.name} follows no goals, so a given one means nothing to it")
+        raise ConfigError(f"{agent.name} follows no goals, so a given one has no effect")
 
 
 def _fixed(

@@ -97,7 +97,7 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
         there = set(os.listdir(self.path))
         # Of a writer that was killed before there was a manifest its lock is left.
         if MANIFEST not in there and there and (LOCK not in there or there - {LOCK, SEGMENTS, INDEX}):
-            raise DataError("not empty and no folder of rollouts: refusing to write into it", file=self.path)
+            raise DataError("not empty and not a folder of rollouts: refusing to write into it", file=self.path)
         self._lock = Lock(self.path / LOCK)
         self.close = self._lock.close
         try:
@@ -236,7 +236,7 @@ def file_stem(segment_id: str) -> str:
 def _read_manifest(path: Path) -> dict[str, Any]:
     file = path / MANIFEST
     if not file.is_file():
-        raise DataError(f"no folder of rollouts: it has no {MANIFEST}", file=path)
+        raise DataError(f"not a folder of rollouts: it has no {MANIFEST}", file=path)
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
