@@ -1,9 +1,9 @@
-"""Simulate the included agent by each way to search, and print gain and cost of each as a table.
+"""Measure what each way to search gives the included agent, and what it costs.
 
     python benchmarks/search_table.py --data DIR --out FOLDER      # FOLDER keeps a record of every evaluation
 
-``DIR`` holds the stores ``town-small/test`` (of which the first 130 segments are taken) and ``ngsim-test``; the
-included test segments are taken, too. Evaluations whose records exist are not made again.
+writes ``results/search.json``. ``DIR`` holds the stores ``town-small/test`` (of which the first 130 segments are
+taken) and ``ngsim-test``. Evaluations whose records are there are not made again.
 """
 
 from __future__ import annotations
@@ -17,31 +17,30 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from symphony import EvaluateConfig, SegmentStore, builtin_store, evaluate, load_agent
+from symphony import EvaluateConfig, SegmentStore, evaluate, load_agent
 from symphony.envs.scene import SceneBatch
 from symphony.files import write_json
 from symphony.learning.experts import logged
 from symphony.rollouts.unroll import Rollouts
 
 AGENT, ROLLOUTS, NEAR, MOVES = "pretrained:bc_ts_h", 16, 3.0, 5.0
-STORES = {
-    "built-in": (builtin_store("test"), None),
-    "towns": ("town-small/test", 130),
-    "roads": ("ngsim-test", None),
-}
+RECORD = Path(__file__).resolve().parents[1] / "results" / "search.json"
+STORES = {"towns": ("town-small/test", 130), "real roads": ("ngsim-test", None)}
 WAYS: dict[str, dict[str, Any]] = {
     "no search": {"search": "none"},
-    "tree, by the discriminator": {"search": "tree"},
+    "tree, by the discriminator": {"search": "tree", "score": "discriminator"},
     "tree, by flags": {"search": "tree", "score": "flags"},
     "tree, by the rule": {"search": "tree", "score": "rule"},
-    "back, by the discriminator": {"search": "backtrack"},
+    "a leaf each of 16 trees of 2": {"search": "tree", "score": "rule", "goals": "tree", "trees": 16, "branches": 2},
+    "back, by the discriminator": {"search": "backtrack", "score": "discriminator"},
     "back, by the rule": {"search": "backtrack", "score": "rule"},
 }
 FIGURES = {
-    "collisions %": ("collision_rate_at_states", 1),
-    "off-road %": ("offroad_time", 2),
-    "minSADE m": ("min_sade", 2),
+    "collisions %": ("collision_rate", 1, True),
+    "minSADE m": ("min_sade", 2, False),
+    "steps": ("relative", 2, False),
 }
+"""Their names in an evaluation, digits, and whether their standard error is shown."""
 
 
 def along_log(scenes: SceneBatch, rollouts: Rollouts) -> Float[Tensor, "B K"]:
@@ -73,7 +72,7 @@ METRICS = tuple(f"{Path(__file__)}:{metric.__name__}" for metric in (along_log, 
 
 def record(data: Path, out: Path, store: str, way: str) -> dict[str, Any]:
     """Return the numbers of an evaluation, and what it cost."""
-    file = out / f"{store} {way}.json".replace(" ", "-").replace(",", "")
+    file = out / f"{store.rsplit(maxsplit=1)[-1]} {way}.json".replace(" ", "-").replace(",", "")
     if not file.exists():
         place, count = STORES[store]
         segments = SegmentStore(data / place)
@@ -88,22 +87,36 @@ def record(data: Path, out: Path, store: str, way: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Make what is missing, then the table, a row for each way and store."""
+    """Make what is not there, then the record of the table, a row for each way."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--commit", default="", help="commit that the evaluations were made at, for the record")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    columns = ["", *FIGURES, "steps", "CPU s a segment", f"of {ROLLOUTS} on the log's route", "any %"]
-    lines = [columns, ["---"] * len(columns)]
+    columns: list[list[Any]] = [[""]]
+    rows: list[list[Any]] = [[way] for way in WAYS]
     for store in STORES:
-        found = {way: record(given.data, given.out, store, way) for way in WAYS}
-        for way, one in found.items():
-            cells = [f"{one[name]:.{digits}f} ± {one[f'{name}_se']:.{digits}f}" for name, digits in FIGURES.values()]
-            costs = [one["steps"] / found["no search"]["steps"], one["seconds"] / one["segments"]]
-            cells += [*(f"{cost:.2f}" for cost in costs), f"{one['along']:.1f}", f"{one['any']:.0f}"]
-            lines.append([f"{store}: {way}", *cells])
-    print("\n".join(f"| {' | '.join(line)} |" for line in lines))
+        columns += [[f"{store}: {heading}", digits] for heading, (_, digits, _) in FIGURES.items()]
+        found = [record(given.data, given.out, store, way) for way in WAYS]
+        for row, one in zip(rows, found, strict=True):
+            one["relative"], one["cpu"] = one["steps"] / found[0]["steps"], one["seconds"] / one["segments"]
+            for name, digits, error in FIGURES.values():
+                values = [round(one[key], digits) for key in (name, f"{name}_se")[: 1 + error]]
+                row.append(values if error else values[0])
+        for way, one in zip(WAYS, found, strict=True):
+            route = f"{one['along']:.1f} of {ROLLOUTS} on the log's route, any in {one['any']:.0f} %"
+            print(f"{store}: {way}: {route}, off-road {one['offroad_time']:.2f} %, {one['cpu']:.2f} CPU s a segment")
+    made = {"commit": given.commit, "command": "python benchmarks/search_table.py"}
+    write_json(
+        RECORD,
+        {
+            "of": "what each way to search gives the included agent: 130 and 170 segments, 16 rollouts",
+            "made": made,
+            "columns": columns,
+            "rows": rows,
+        },
+    )
 
 
 if __name__ == "__main__":
