@@ -58,7 +58,7 @@ def pdm(run: Mapping[str, Any], saved: SavedRollouts, collisions: list[int]) -> 
     """Return the terms of one run of the ego; None if it failed, or the boundary or its progress is not defined.
 
     Args:
-        run: its row of :class:`symphony.evaluation.report.Report`.
+        run: the run's row of :class:`symphony.evaluation.report.Report`.
         saved: the rollouts that it is one of.
         collisions: rows of the agents that it ran into, at fault.
     """

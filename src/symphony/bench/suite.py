@@ -98,7 +98,7 @@ class Suite:
     """A suite, read and checked.
 
     Attributes:
-        items: rows of the store that are driven, in the order in which they are.
+        items: the rows of the store that are driven, in the order in which they are.
         baseline: a planner of the suite that others are compared with, or the ``result.json`` of an earlier run of
             it; empty for none.
     """

@@ -33,7 +33,7 @@ class Backtrack:
     Args:
         threshold: in the units of the totals.
         back: periods, counted from the end of the bad one (1 repeats that alone); 0 for the first state.
-        cap: of what is simulated again, in lengths of a line: bounds the cost of starts from which nothing goes well.
+        cap: bound on what is simulated again, in lengths of a line, and on the cost of starts where all goes wrong.
         renew: ``renew(state, attempt) -> state`` makes the state [R, 1] that lines go on from. It gets the kept
             entries of the step they go back to and how often each line [R] has gone back so far, and must give them
             other random numbers than before, and what was not kept of the entries that the start state has. None

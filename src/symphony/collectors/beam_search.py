@@ -128,7 +128,7 @@ def beam_search(
     Args:
         env: can be branched, see :func:`check_branching`. Its transforms are applied to the branches.
         policy: writes the action into the TensorDict it is given.
-        score: of the state after a step, [*b, S, N] or [*b, S]; high is bad, padded agents 0. It gets the next
+        score: score of the state after a step, [*b, S, N] or [*b, S]; high is bad, padded agents 0. It gets the next
             state with reward and action, and must not write into it.
         start: [*b, S], e.g. ``branch(env.reset(...), S)``.
         steps: T, decisions per branch.
@@ -136,11 +136,11 @@ def beam_search(
         rule: which branches go on; or :class:`Backtrack`, with which nothing is
             copied: branches are independent lines that go back where they are bad. That takes no gradients and gives
             all leaves, and what is said below of slots, groups, values and noise has no meaning for it.
-        aggregate: of the scores of a period [*b, S, T_p, N] to totals [*b, S]: an :class:`Aggregate`, which leaves
-            out steps after an end, or any function, e.g. ``lambda scores: scores.amax((-1, -2))``.
-        value: of the state after a period, [*b, S] in the units of the totals and high where much is still to come
-            that is bad; added to what the rule sees, but where the episode has terminated. Where it was truncated, it
-            is that of the state in which it was.
+        aggregate: function from the scores of a period [*b, S, T_p, N] to totals [*b, S]: an :class:`Aggregate`,
+            which leaves out steps after an end, or another, e.g. ``lambda scores: scores.amax((-1, -2))``.
+        value: value of the state after a period, [*b, S] in the units of the totals and high where much is still to
+            come that is bad; added to what the rule sees, but where the episode has terminated. Where it was
+            truncated, it is that of the state in which it was.
         accumulate: the rule sees the sum of the totals of a branch's whole history, not those of the period alone.
         prune_last: prune after the last period too.
         until_done: False if ends of episodes are to change nothing at all.
@@ -154,7 +154,7 @@ def beam_search(
         leaves: how many to return, the best by their `leaf_costs` first; default all, in the order of their slots.
         compile_step: compile policy, environment and score of a step as one program, or how, as
             :func:`torch.compile` takes it.
-        exploration_type: under which the policy runs.
+        exploration_type: the exploration type under which the policy runs.
 
     Raises:
         ValueError: for an environment that can't be branched, arguments that contradict each other, wrong shapes, or

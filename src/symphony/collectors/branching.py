@@ -111,7 +111,7 @@ def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> E
 
     Args:
         env: with rows [*b], or for any batch shape.
-        shape: of the states, [*b, S].
+        shape: the batch shape of the states, [*b, S].
         share: what its transforms learn, such as the statistics of VecNorm, is one with the environment's; else it is
             a copy of its own, and frozen.
     """

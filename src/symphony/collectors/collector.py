@@ -44,10 +44,10 @@ class BeamSearchCollector(Collector):
     Args:
         create_env_fn: as for :func:`beam_search`; for more than one row with a batch size: ``with_rows(env, [B])``.
         policy: as for :class:`Collector`; random actions by default.
-        score: of the state after a step, see :func:`beam_search`.
+        score: score of the state after a step, see :func:`beam_search`.
         branches: S.
         leaves: L; by default the best leaf alone, without a dimension of its own.
-        prepare: called on the branched start state [*env.batch_size, S], e.g. to give each branch a group.
+        prepare: function called on the branched start state [*env.batch_size, S], e.g. to give each branch a group.
         keep_tree: also return the pruned branches; with ``leaves=branches`` only.
         rule_noise: ``rule_noise(start, periods)`` gives numbers in [0, 1) for rules that draw, as `noise` of
             :func:`beam_search`; by default from a generator that :meth:`set_seed` sets.

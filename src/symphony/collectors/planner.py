@@ -32,9 +32,9 @@ class BeamSearchPlanner(MPCPlannerBase):
         value_network: writes ``"state_value"`` [..., 1], the return that is to be expected from a state.
         prune_every: steps per period.
         rule: which branches go on.
-        temperature: of the weights of branches, in the units of the return.
-        reward_key: of the reward below ``"next"``.
-        action_key: of the action.
+        temperature: temperature of the weights of branches, in the units of the return.
+        reward_key: key of the reward below ``"next"``.
+        action_key: key of the action.
         noise: numbers for rules that draw, from the planned states and the number of periods.
     """
 

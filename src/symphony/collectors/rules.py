@@ -48,7 +48,7 @@ class Aggregate:
         """Return the totals; an agent none of whose steps counts has 0.
 
         Args:
-            scores: of all steps.
+            scores: the scores of all steps.
             alive: which of them count, the first ones; all of them if None.
         """
         alive = torch.ones_like(scores[..., :1], dtype=torch.bool) if alive is None else alive
@@ -80,7 +80,7 @@ class KeyScore:
 
     Args:
         key: [*b, S], [*b, S, N] or [*b, S, N, 1], any number or bool.
-        module: called first, on a shallow copy, if the entry is its output.
+        module: a module called first, on a shallow copy, if the entry is its output.
         negate: for entries of which *high* is good, such as a reward.
         valid_key: [*b, S, N] bool, if scores of padded agents are to be 0.
     """
@@ -303,11 +303,11 @@ class Pruning:
     The arguments are those of :func:`symphony.collectors.beam_search`.
 
     Attributes:
-        totals: of each period [*b, S].
+        totals: the totals of each period [*b, S].
         seen: what the rule saw of them.
         parents: the slots that each slot continued from.
         active: rows [*b] in which some episode went on.
-        log_weights: of the branches before each pruning, for rules that weigh.
+        log_weights: log-weights of the branches before each pruning, for rules that weigh.
     """
 
     def __init__(

@@ -72,15 +72,15 @@ class DrivingEnv(EnvBase):
             every reset of a whole batch draws as many as the batch has rows.
         dynamics: :class:`Bicycle` (joint discrete actions) or :class:`Displacement` (metres).
         observation: what the agents observe.
-        reward: of a step, from the state before it (with its action) and the state after it, ``[*b, N]``; by default
-            -1 for an agent that collides or is off the road.
+        reward: reward ``[*b, N]`` of a step, from the state before it (with its action) and the state after it; by
+            default -1 for an agent that collides or is off the road.
         ends_on: what ends the episode of a scene, for any of its interactive agents.
         after_collision: what becomes of interactive agents whose boxes overlap another: they ``go-on``, ``stop`` for
             as long as they overlap, are gone from the next step on (``remove``), or until there is room where they
             began (``respawn``); the last two in open traffic only.
-        seed: of the scenes that :meth:`reset` draws; by default another one in every instance and process.
-        generator: draws them instead.
-        device: of the scenes from a source; others stay where they are.
+        seed: the seed of the scenes that :meth:`reset` draws; by default another in every instance and process.
+        generator: the generator that draws them instead.
+        device: the device of scenes from a source; others stay where they are.
 
     ``reset(rows, set_state=False)`` starts the scenes named in their ``scene`` entry, or draws them at random;
     where only some rows are reset, they start other scenes of those at hand. ``reset(state, set_state=True)`` starts

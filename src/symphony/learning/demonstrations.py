@@ -57,11 +57,11 @@ class ItemCache(Generic[T]):
     Warns once when items asked for have to go although fewer than ``keep`` are held.
 
     Args:
-        make: gives the values of some items, in their order.
-        size: gives the bytes of a value.
+        make: function that returns the values of some items, in their order.
+        size: function that returns the bytes of a value.
         keep: items held at most; None for no bound.
         limit: bytes held at most, beyond the last request; :func:`room` by default.
-        name: of what is held, for the warning.
+        name: name of the values, for the warning.
 
     Attributes:
         kept: what is held, with its bytes, by item.

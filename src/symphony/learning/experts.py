@@ -89,7 +89,7 @@ def fit_experts(
     Args:
         segments: the run segments.
         dynamics: the action space.
-        graphs: of their lanes, built here if not given.
+        graphs: lane graphs of the segments, built here if not given.
         routes: whether to find the experts' routes.
     """
     graphs = [LaneGraph(segment.road) for segment in segments] if graphs is None else graphs

@@ -60,9 +60,9 @@ def way_back(
 
     Args:
         state: x, y, heading, speed of the vehicle.
-        logged: of the log at that time.
-        following: of the log a step later.
-        length: of the boxes, metres.
+        logged: the same of the log at that time.
+        following: the same of the log a step later.
+        length: length of the boxes, metres.
         dt: seconds per step.
     """
     error = rotate(state[:, :2] - logged[:, :2], -logged[:, 2])
@@ -96,13 +96,13 @@ def perturbed(
     Args:
         state: x, y, heading, speed of the fitted experts.
         action: their actions [M] or [M, 2].
-        logged: of the log at that time.
-        following: of the log a step later.
-        size: of the boxes, metres.
+        logged: the same of the log at that time.
+        following: the same of the log a step later.
+        size: size of the boxes, metres.
         dynamics: the action space.
         dt: seconds per step.
-        share: of the states that are displaced.
-        rng: for all draws.
+        share: share of the states that are displaced.
+        rng: generator of all draws.
     """
     chosen = (torch.rand(len(state), generator=rng) < share).nonzero()[:, 0]
     moved, before, size = displaced(logged, rng)[chosen], logged[chosen], size[chosen]

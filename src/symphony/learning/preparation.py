@@ -30,12 +30,12 @@ def prepare(
     they are; the files do not depend on the workers.
 
     Args:
-        path: folder of the store.
+        path: the folder of the store.
         dynamics: the action space.
         routes: whether their routes are found, too.
         duration: seconds of each run segment that are used; 0 for all.
-        workers: processes.
-        engine: that runs them.
+        workers: number of processes.
+        engine: the engine that runs them.
 
     Yields:
         Run segments done, and their total.

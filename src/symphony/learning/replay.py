@@ -50,11 +50,11 @@ class SearchReplay:
 
     Args:
         collector: keeps the whole tree.
-        env: it searches in.
-        data: that the environment draws its scenes from.
+        env: the environment it searches in.
+        data: the data that the environment draws its scenes from.
         every: updates made from one search.
         states: K, simulated and logged ones each, drawn for the discriminator.
-        segments: of one search, at most.
+        segments: run segments of one search, at most.
 
     Attributes:
         period: updates from one draw of scenes to the next, K x `every`.
@@ -103,7 +103,7 @@ class SearchReplay:
 
         Args:
             count: K.
-            rng: of the draw.
+            rng: the generator of the draw.
             observation: what the policy observes.
 
         Returns:
@@ -123,7 +123,7 @@ class SearchReplay:
 
         Args:
             count: K.
-            rng: of the draw.
+            rng: the generator of the draw.
             observation: what the policy observes.
 
         Returns:
@@ -143,7 +143,7 @@ class SearchReplay:
         routes they took.
 
         Args:
-            rng: of the draw.
+            rng: the generator of the draw.
 
         Returns:
             TensorDict [2 K, N]: observation and ``SIMULATED``.

@@ -24,7 +24,7 @@ class MaskedLoss(LossModule):
 
     Args:
         reduction: `"mean"` (also for None), `"sum"` or `"none"`.
-        use_mask: of the mask under the `valid` key. None: it counts where there is one, and must be there if the
+        use_mask: use of the mask under the `valid` key. None: it counts where there is one, and must be there if the
             network (or the environment) reads it, too, so that no padding is trained on unnoticed. True: it must be
             there. False: it is not read, and everything counts.
 
@@ -134,7 +134,7 @@ class Fit(NamedTuple):
         cost: negative log-likelihood after label smoothing.
         nll: negative log-likelihood, detached.
         counted: bool, entries that count.
-        entropy: of the actor, detached; None unless it is categorical.
+        entropy: entropy of the actor, detached; None unless it is categorical.
         hit: 1.0 where the actor's mode is the action; None unless it is categorical.
     """
 

@@ -34,11 +34,11 @@ class MGAILLoss(MaskedLoss):
     with its choices held fixed, at the memory of the survivors alone.
 
     Args:
-        actor_network: draws with gradient (`has_rsample`).
-        discriminator: writes one logit per entry, `[..., N]`, under the `score` key.
+        actor_network: the actor, which draws with gradient (`has_rsample`).
+        discriminator: module that writes one logit per entry, `[..., N]`, under the `score` key.
         env: differentiable; steps any batch shape. May be replaced between calls.
         horizon: T, steps per rollout; given numbers decide it where there are any.
-        cost: of a logit, see :data:`COSTS`.
+        cost: cost of a logit, see :data:`COSTS`.
         detach_keys: inputs of the actor through which no gradient flows back to earlier states. Without them
             gradients pass through the actor's reactions too.
         truncate: steps after which the gradient is cut; 0: never.

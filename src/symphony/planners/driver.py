@@ -68,10 +68,10 @@ class EgoPlanners(NamedTuple):
     """The planner of one agent in each scene of a batch: the ego, or another, which is the ego of its planner.
 
     Attributes:
-        name: of the planner.
-        make: makes one.
+        name: the name of the planner.
+        make: a function that makes one planner.
         segments: behind the scenes, in their order.
-        seconds: that a planner has for one answer.
+        seconds: the time that a planner has for one answer.
     """
 
     name: str
@@ -108,7 +108,7 @@ class EgoPolicy(TensorDictModuleBase):
         env: the environment.
         egos: how the first interactive agents are planned.
         start: [...] states at which planners begin, the agents on the routes of the log; each gets its numbers.
-        seed: of all rollouts.
+        seed: the seed of all rollouts.
         rule: made with an environment and the parameters of an IDM that has no ``plan`` of its own, it drives.
         forked: a search will copy planners with its branches.
 

@@ -109,7 +109,7 @@ class Scenario:
     A copy is the scenario itself, so that planners that keep it are cheap to fork.
 
     Attributes:
-        segment_id: of the run segment.
+        segment_id: the id of the run segment.
         dt: seconds per step.
         steps: how often the planner will be asked.
         ego: row of the ego in :class:`Traffic`.
@@ -125,7 +125,7 @@ class Scenario:
         agent_id: [A] the source's ids.
         log: [T, 4] what the ego did, for planners that play it back.
         log_valid: [T].
-        seed: of the planner's own random numbers, which should depend on nothing else; another for each rollout.
+        seed: seed of the planner's own random numbers, which should depend on nothing else; another for each rollout.
     """
 
     segment_id: str

@@ -47,7 +47,7 @@ class ProcessPlanner:
     """A planner that asks a process of its own.
 
     Args:
-        command: that starts it, as in a shell without its special characters.
+        command: the command that starts it, as in a shell without its special characters.
     """
 
     def __init__(self, command: str) -> None:

@@ -187,7 +187,7 @@ class FunctionPlanner:
     """A planner that is a function of the observation alone; it remembers nothing, so it is its own copy.
 
     Args:
-        function: from an :class:`Observation` to a plan.
+        function: a function from an :class:`Observation` to a plan.
     """
 
     def __init__(self, function: Callable[[Observation], Any]) -> None:

@@ -128,7 +128,7 @@ class LaneGraph:
         regions: the branching regions, by parent, then by lane.
         followed: lines [P, 2] of pairs of a lane and its successor that were sought already, see
             :func:`symphony.roadgraph.paths.followed`.
-        gentle: of lanes that were checked already, see :func:`symphony.roadgraph.paths.gentle`.
+        gentle: results for lanes that were checked already, see :func:`symphony.roadgraph.paths.gentle`.
     """
 
     def __init__(self, road: Any, *, exclude: Collection[int] = (BIKE_LANE,)) -> None:

@@ -52,7 +52,7 @@ class CarFollower(TensorDictModuleBase):
     count. One without a route goes straight on.
 
     Args:
-        env: whose scenes have routes.
+        env: an environment whose scenes have routes.
         driver: the parameters, if they are not the usual ones.
     """
 

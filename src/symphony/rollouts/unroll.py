@@ -108,7 +108,7 @@ class RouteGoals(Transform):
     Args:
         goals: a goal policy, such as an agent's ``goals``, or another module that reads ``ROUTES`` and
             ``ROUTES_MASK`` and writes ``GOAL``; by default agents follow the routes nearest to the log.
-        seed: of the draws, beside the rollout's identity.
+        seed: the seed of the draws, beside the rollout's identity.
 
     Raises:
         ConfigError: on reset, if the scenes come without routes.

@@ -25,7 +25,7 @@ class Tracker:
     """Writes the metrics of a run; DataError if the disk refuses, ConfigError if Weights & Biases does.
 
     Args:
-        folder: of the run; ``metrics.jsonl`` is written there.
+        folder: the run's folder; ``metrics.jsonl`` is written there.
         settings: shown by Weights & Biases beside the curves.
         wandb: ``offline``, ``online`` or ``disabled``; the environment variable ``WANDB_MODE`` overrides it.
         after: keep only records up to this step of an earlier, interrupted run, which this one continues.

@@ -172,14 +172,14 @@ class Trainer:
     optimizers, so a resumed run ends with the same weights as one that was never stopped.
 
     Args:
-        config: of the run; written whole to its folder.
-        agent: what learns, on its device.
-        data: what it learns from.
-        phases: stretches of updates, in their order.
-        optimizers: by name; each is stepped on the losses that come under its name.
+        config: the run's configuration; written whole to its folder.
+        agent: the agent to train, on its device.
+        data: the scenes to learn from.
+        phases: the stretches of updates, in their order.
+        optimizers: the optimizers by name; each is stepped on the losses that come under its name.
         rng: the generator of all draws of updates; seeded again before each.
-        processes: those that train together.
-        replay: of searches, where there are any.
+        processes: the processes that train together.
+        replay: the draws from searches, where there are any.
 
     Attributes:
         validator: a hook called at every checkpoint, of which the best then is the run's agent.
