@@ -31,7 +31,7 @@ class Backtrack:
     on, and then the last of them again and again. Once it has been simulated `cap` times over, it goes on as it is.
 
     Args:
-        threshold: in the units of the totals.
+        threshold: the threshold in the units of the totals.
         back: periods, counted from the end of the bad one (1 repeats that alone); 0 for the first state.
         cap: bound on what is simulated again, in lengths of a line, and on the cost of starts where all goes wrong.
         renew: ``renew(state, attempt) -> state`` makes the state [R, 1] that lines go on from. It gets the kept

@@ -45,20 +45,20 @@ class BeamSearchResult:
     leaves come in the order of their slots: with :class:`KeepBest`, slot 0 holds the best of the last period.
 
     Attributes:
-        trajectories: [*b, L, T] of the leaves, laid out and named as by ``env.rollout``, kept entries only.
-        scores: [*b, L, T, N] of what each step of the leaves led to, 0 after the end of an episode.
+        trajectories: [*b, L, T] steps of the leaves, laid out and named as by ``env.rollout``, kept entries only.
+        scores: [*b, L, T, N] scores of what each step of the leaves led to, 0 after the end of an episode.
         alive: [*b, L, T] steps before (and with) the end of their episodes.
         slots: [*b, P, L] int64, the slot in which each period of each leaf's history was simulated.
         totals: [*b, P, S] aggregate of each period, by the slot that simulated it.
         parents: [*b, P, S] int64; after period p slot s was continued from slot `parents[..., p, s]`.
-        simulated_scores: [*b, S, T, N] by the slot that simulated the step, the pruned ones included.
+        simulated_scores: [*b, S, T, N] scores by the slot that simulated the step, the pruned ones included.
         tree: [*b, S, T] all simulated steps by slot, if asked for.
         prune_every: T_p; the last period may be shorter.
         simulated_steps: branch-steps that were simulated.
         leaf_costs: [*b, L] what the rule saw of the leaves in the last period in which their row had not ended.
         log_weights: [*b, P, S] before each pruning, minus the totals since the row was last resampled, by the
             temperature; None unless the rule is a :class:`Resampling`, like the following.
-        leaf_log_weights: [*b, L] after the last pruning, relative to the mean weight; 0 where it resampled.
+        leaf_log_weights: [*b, L] those after the last pruning, relative to the mean weight; 0 where it resampled.
         log_evidence: [*b] estimate of the logarithm of the mean weight of unpruned branches, whose exponential has no
             bias: of the evidence, where totals are negative log-likelihoods and the temperature is 1.
     """

@@ -110,7 +110,7 @@ def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> E
     """Return the environment for states of a batch shape, with its transforms; ValueError if it can't be branched.
 
     Args:
-        env: with rows [*b], or for any batch shape.
+        env: an environment with rows [*b], or for any batch shape.
         shape: the batch shape of the states, [*b, S].
         share: what its transforms learn, such as the statistics of VecNorm, is one with the environment's; else it is
             a copy of its own, and frozen.

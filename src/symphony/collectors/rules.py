@@ -173,7 +173,7 @@ class Resampling:
     rule sees are the totals since a row was last resampled.
 
     Args:
-        temperature: in the units of the totals; 1 where they are negative log-likelihoods.
+        temperature: the temperature in the units of the totals; 1 where they are negative log-likelihoods.
         threshold: share of S. A row whose effective sample size 1 / sum(w^2) is larger is not resampled: its branches
             go on with their weights, which the search carries to the next period.
 
@@ -263,7 +263,7 @@ class ReplaceBad:
     good, all stay. NaN is above every threshold.
 
     Args:
-        threshold: in the units of the totals.
+        threshold: the threshold in the units of the totals.
     """
 
     threshold: float

@@ -73,8 +73,8 @@ class Traffic:
         ego: row of the ego.
         state: [4] of the ego: x, y, heading, speed along it.
         position: [A, 2] box centres; 0 where not valid.
-        heading: [A].
-        velocity: [A, 2].
+        heading: [A] headings.
+        velocity: [A, 2] velocities.
         size: [A, 2] length, width.
         agent_type: [A] :class:`symphony.data.segment.AgentType`.
         valid: [A] which agents are present.
@@ -124,7 +124,7 @@ class Scenario:
         signal_point: [Q, 2] its stop point.
         agent_id: [A] the source's ids.
         log: [T, 4] what the ego did, for planners that play it back.
-        log_valid: [T].
+        log_valid: [T] where that is known.
         seed: seed of the planner's own random numbers, which should depend on nothing else; another for each rollout.
     """
 
