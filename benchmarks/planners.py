@@ -109,7 +109,7 @@ def planner(kind: str, env: EnvBase) -> Any:
 
 @torch.no_grad()
 def measured(name: str, kind: str) -> list[float]:
-    """The mean return over seeds, and its standard error."""
+    """Compute the mean return over seeds, and its standard error."""
     returns = []
     for seed in range(SEEDS):
         torch.manual_seed(seed)

@@ -251,7 +251,6 @@ class _Asked(_Driver):
         return Failure(step, f"{self.who[row]}{when}: {_words(error)}")
 
     def begin(self, start: TensorDictBase) -> Tensor:
-        """Return the numbers [..., 1] of the planners."""
         return torch.arange(start.numel(), device=start.device).reshape(*start.shape, 1)
 
     def _route(self, row: int) -> NDArray[np.float32]:
@@ -262,7 +261,6 @@ class _Asked(_Driver):
         return self.env.scenes.whole_route(row, self.place, which).cpu().numpy()
 
     def moved(self, tensordict: TensorDictBase, number: Tensor) -> tuple[Tensor, Tensor]:
-        """Return planned states [..., 4] and numbers of planners [...]."""
         scene, at, place = *(tensordict.get(key).flatten() for key in (keys.SCENE, keys.STEP)), self.place
         state, valid, progress = (
             tensordict.get(key).flatten(0, tensordict.ndim - 1) for key in (keys.STATE, keys.VALID, keys.PROGRESS)
@@ -313,7 +311,6 @@ class _Asked(_Driver):
         return [planner if isinstance(planner, Failure) else None for planner in found]
 
     def meant(self, number: Int[Tensor, "*b"], steps: int) -> NDArray[np.float32] | None:
-        """Return the planned trajectories, see :meth:`EgoPolicy.meant`."""
         given = [self._meant[n] for n in number.flatten().tolist()]
         most = max((len(plan) for plans in given for plan in plans.values()), default=0)
         found = np.full((len(given), steps, most, 2), np.nan, np.float32)

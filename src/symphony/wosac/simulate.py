@@ -167,7 +167,6 @@ def simulated_scenarios(
 def _simulated(
     agent: Agent, settings: WosacSettings, packed: tuple[Path, int, bytes]
 ) -> tuple[str, SimulatedRollouts]:
-    """Return the id and the rollouts of a packed scenario."""
     file, record, payload = packed
     scenario = parse_scenario(payload, file, record)
     try:

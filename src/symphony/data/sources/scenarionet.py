@@ -149,7 +149,6 @@ def _sizes(sizes: Doubles, valid: Bools, ego: int) -> schema.Floats:
 
 
 def _signals(states: Any, lanes: Sequence[Lane], steps: int, dataset: str) -> Lights:
-    """Return the lights of the lanes."""
     index = {lane.name: k for k, lane in enumerate(lanes)}
     found: Lights = {}
     with located(field="dynamic_map_states"):

@@ -205,7 +205,6 @@ def _index(track: int, renumber: dict[int, int], field: str) -> int:
 
 
 def _sizes(sizes: Doubles, valid: Bools, current: int) -> Doubles:
-    """Return [A, 3] from [A, T, 3]."""
     steps = valid.shape[1]
     refuse(not 0 <= current < steps, f"{current} outside the {steps} steps", "current_time_index")
     result = sizes[:, current].copy()
@@ -257,7 +256,6 @@ def _features(features: Sequence[pb.MapFeature]) -> tuple[list[Lane], list[Doubl
 
 
 def _signals(scenario: pb.Scenario, steps: int, lanes: Sequence[Lane]) -> Lights:
-    """Return the lights of the lanes."""
     logged = scenario.dynamic_map_states
     refuse(logged and len(logged) != steps, f"{len(logged)} entries for {steps} steps", "dynamic_map_states")
     _check_count(sum(len(now.lane_states) for now in logged), MAX_LINKS, "dynamic_map_states")
