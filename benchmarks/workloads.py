@@ -87,8 +87,7 @@ def ring(seed: int, agents: int = AGENTS, points: int = POINTS, steps: int = 11)
         "edge_valid": np.ones(points),
         "stream": seed,
         "route_point": np.zeros((0, 2)),
-        "route_first": np.zeros((agents, 0)),
-        "route_count": np.zeros((agents, 0)),
+        **dict.fromkeys(("route_first", "route_count", "follow_first", "follow_count"), np.zeros((agents, 0))),
         "route_logged": np.full(agents, -1),
     }
     made = {name: torch.as_tensor(value)[None].to(getattr(base, name).dtype) for name, value in fields.items()}

@@ -12,17 +12,23 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from helpers_segments import CAR, crossing, make_road, straight_road
+from helpers_segments import CAR, LANE_WIDTH, crossing, make_road, make_segment, straight_road
 from symphony import DrivingEnv, ObservationConfig, keys
+from symphony.agents import load_agent
+from symphony.config.evaluation import SimulateConfig
 from symphony.envs import CHOICE_FEATURES, ROUTE_FEATURES, Bicycle, Displacement, collate, scene
 from symphony.envs import routes as module
 from symphony.envs.objects import Objects, entering
 from symphony.envs.routes import POINTS, SPACING, FollowedRoutes, route_ahead, route_choices, route_table
-from symphony.envs.scene import leaving
+from symphony.envs.scene import leaving, map_edge
 from symphony.errors import DataWarning
 from symphony.geometry.boxes import box_gap
 from symphony.geometry.polylines import stations_along
 from symphony.roadgraph import LaneGraph
+from symphony.roadgraph.paths import sharpest
+from symphony.roadgraph.routes import change_length
+from symphony.rollouts.driving import simulation
+from symphony.rollouts.onward import Onward
 from test_env import actions, run
 
 SCALE = 20.0
@@ -128,7 +134,7 @@ def test_what_else_is_in_the_table_changes_nothing(count, seed):
     first, length = (torch.from_numpy(rng.integers(0, 100, (2, 2, 3))) for _ in range(2))
     table[1, 250 : 250 + count] = torch.from_numpy(line)
     first[1, 0, 2], length[1, 0, 2] = 250, count
-    routes = module.Routes(table, first, length)
+    routes = module.Routes(table, first, length, (first, length))
     found = routes.of(torch.tensor([1]), torch.tensor([[2, -1]]))
     points, exist = found.lines()
     assert torch.equal(points[0, 0, :count], torch.from_numpy(line))
@@ -396,3 +402,53 @@ def test_who_is_beyond_any_side_of_the_map_has_left():
     after = torch.tensor([[[9.0, -9], [11, 0], [-11, 9], [0, 10.5], [3, -12]]])
     none = torch.zeros(1, 2, 4)
     assert leaving(torch.zeros_like(after), after, none, hull).tolist() == [[False, True, True, True, True]]
+
+
+def lanes_that_end(pieces):
+    """A road of two lanes: that by which one comes ends after 60 m; what goes on past a bend begins beside it."""
+    lines, links, beside, end, way = [], [], {1: [], -1: []}, 0j, 1 + 0j
+    for side, turn in pieces:
+        own, angle = end + way * np.arange(0, 61, 2), np.linspace(0, turn, 14)
+        other = own + side * LANE_WIDTH * 1j * way
+        bend = other[-1] + way * np.cumsum(1.5 * np.exp(1j * angle))
+        k = len(lines)
+        lines += [own, other, np.concatenate([other[-1:], bend])]
+        links += [(k + 1, k + 2), (k + 2, k + 3)]
+        beside[side].append((k, k + 1))
+        beside[-side].append((k + 1, k))
+        end, way = bend[-1], way * np.exp(1j * turn)
+    flat = [np.stack([line.real, line.imag], -1) for line in lines]
+    return make_road(flat, links[:-1], left=beside[1], right=beside[-1])
+
+
+@settings(max_examples=4)
+@given(
+    st.lists(st.tuples(st.sampled_from([-1, 1]), st.floats(-1.5, 1.5)), min_size=9, max_size=9),
+    st.floats(0, 40), st.floats(0, 12),
+)  # fmt: skip
+def test_who_follows_a_route_has_road_ahead_however_often_lanes_end(pieces, x, speed):
+    road, steps, dt = lanes_that_end(pieces), 6, 0.2
+    place = np.full((2, steps, 2), [x, 0.0]) + speed * dt * np.arange(steps)[:, None] * [1.0, 0.0]
+    place[1, :, 1] = pieces[0][0] * LANE_WIDTH
+    graph, zero = LaneGraph(road), np.zeros((2, steps))
+    log = make_segment(road, place, zero, np.stack([zero + speed, zero], -1), dt)
+    segment = Onward(inflow=0.0).extended(log, graph, 151)
+    scenes = scene(segment, [0, 1], graph, edge=map_edge(graph))
+    lanes, end = [shapely.LineString(lane[:, :2]) for lane in road.lanes], road.lanes[len(road.lanes) - 1][-1, :2]
+    area = shapely.union_all(lanes).buffer(LANE_WIDTH / 2 + 0.5)
+    for _, n, g in (scenes.route_count > 1).nonzero().tolist():
+        line, begin = scenes.whole_route(0, n, g).numpy().astype(float), int(scenes.route_first[0, n, g])
+        chosen = scenes.route_point[0, begin : begin + int(scenes.route_count[0, n, g])].numpy()
+        # Whoever drives as fast as it can in 30 s has 200 m ahead, or the end of the road.
+        length, gap = SPACING * (len(line) - 1), np.hypot(*np.diff(line, axis=0).T)
+        assert length > max(240, 1.1 * speed * 30 + 200) - 0.1 or np.hypot(*(line[-1] - end)) < 0.1
+        assert 0 < gap.min() <= gap.max() < SPACING + 1e-3
+        assert area.covers(shapely.LineString(line))
+        assert sharpest(line) < np.radians(35)
+        # What it was chosen by is what is followed, up to where the change begins.
+        same = max(0, len(chosen) - 1 - int(np.ceil(change_length(speed) / SPACING)))
+        assert np.array_equal(line[:same], chosen[:same])
+    found = simulation(load_agent("idm"), scenes, SimulateConfig(rollouts=1)).rollouts
+    there = found.counted[0, 0].numpy()
+    assert shapely.distance(area, shapely.points(found.state[0, 0, 1:, :, :2].numpy()[there])).max() == 0
+    assert there[:100].all()

@@ -33,10 +33,7 @@ SCORE: Key = ("agents", "score")  # [..., N]: the discriminator's logit; high wh
 SIMULATED: Key = ("agents", "simulated")  # [..., N] bool: the state comes from a simulation, not from the log
 ROLLOUT: Key = ("agents", "rollout")  # [..., N] bool: the action is of a rollout that survived the search
 
-WEIGHT: Key = (
-    "agents",
-    "weight",
-)  # [..., N]: of an action of a rollout, negative where it should become less likely
+WEIGHT: Key = ("agents", "weight")  # [..., N]: of an action of a rollout, negative where it shall become less likely
 
 OWN: Key = ("agents", "observation", "own")  # [..., N, Fs]
 OBJECTS: Key = ("agents", "observation", "objects")  # [..., N, O, Fo]

@@ -83,10 +83,7 @@ class Estimate:
 
 
 def estimate(
-    values: Sequence[float | None],
-    groups: Sequence[str],
-    confidence: float,
-    kind: Literal["rate", "mean"] = "mean",
+    values: Sequence[float | None], groups: Sequence[str], confidence: float, kind: Literal["rate", "mean"] = "mean"
 ) -> Estimate:
     """Return the mean of the values of some runs (None where not defined; a rate's are 0 and 100) and its one-sided
     bounds over groups, each with a confidence between 0.5 and 1.

@@ -104,12 +104,7 @@ class Result:
 
         def verdict(one: Verdict) -> dict[str, Any]:
             limit, found = one.threshold, one.found
-            who = {
-                "planner": one.planner,
-                "crowd": one.crowd,
-                "threshold": str(limit),
-                "metric": limit.metric,
-            }
+            who = {"planner": one.planner, "crowd": one.crowd, "threshold": str(limit), "metric": limit.metric}
             what = {"compared": limit.compared, "status": one.status, "value": found.mean, "bound": one.bound}
             return {**who, **what, "limit": limit.limit, "runs": found.runs, "groups": found.groups}
 

@@ -99,11 +99,7 @@ SEGMENTS = Table(
         Column("predict", "predict", "<i4"),
         *(Column(name, name, "|u1") for name in ("segment_id", "source", "file", "tags")),
     ),
-    (
-        *((n, "<i8", ()) for n in ("map", "steps", "ego", "current_step")),
-        ("dt", "<f8", ()),
-        ("origin", "<f8", (3,)),
-    ),
+    (*((n, "<i8", ()) for n in ("map", "steps", "ego", "current_step")), ("dt", "<f8", ()), ("origin", "<f8", (3,))),
 )
 MAPS = Table(
     "maps",

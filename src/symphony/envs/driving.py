@@ -222,10 +222,7 @@ class DrivingEnv(EnvBase):
         return {name: value for name, value in super().__getstate__().items() if name != "_step"}
 
     def start(
-        self,
-        scene: Int[Tensor, "*b"],
-        rollout: Int[Tensor, "*b"] | int = 0,
-        goal: Int[Tensor, "*b N"] | None = None,
+        self, scene: Int[Tensor, "*b"], rollout: Int[Tensor, "*b"] | int = 0, goal: Int[Tensor, "*b N"] | None = None
     ) -> TensorDict:
         """Return the state at the first logged step, as :meth:`reset` returns it.
 

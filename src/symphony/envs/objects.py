@@ -166,10 +166,7 @@ def rollout_heights(
 
 @torch.no_grad()
 def entering(
-    objects: Objects,
-    index: Int[Tensor, "M N"],
-    ready: Bool[Tensor, "M N"],
-    late: Bool[Tensor, "M N"] | None = None,
+    objects: Objects, index: Int[Tensor, "M N"], ready: Bool[Tensor, "M N"], late: Bool[Tensor, "M N"] | None = None
 ) -> Bool[Tensor, "M N"]:
     """Return which of the ready agents can enter, far enough from all others: farther where they come ``late``, past
     the log, where no log shows that it went well.

@@ -23,7 +23,7 @@ from symphony.geometry.frames import LEVEL, constant, rotate
 from symphony.geometry.nearest import on_host
 from symphony.geometry.polylines import stations_along
 from symphony.roadgraph import LaneGraph, ground_truth_routes, route_lines, routes, starting_lanes
-from symphony.roadgraph.routes import HORIZON
+from symphony.roadgraph.routes import HORIZON, SAME, carried_on, resampled
 from symphony.streams import stream_of
 
 SPACING = 3.0  # metres between the points of a route; its last piece may be shorter
@@ -133,6 +133,33 @@ def packed(tables: Sequence[RouteTable], least: int = 0) -> tuple[NDArray[Any], 
     return np.concatenate([np.zeros((0, 2), np.float32), *(t.points for t in tables)]), first, count
 
 
+def followed(
+    segment: RunSegment,
+    graph: LaneGraph,
+    speed: Sequence[float],
+    point: NDArray[Any],
+    first: NDArray[Any],
+    count: NDArray[Any],
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """The same as :func:`packed` of what N agents with speeds [N] follow: their routes, which are carried on where
+    they end beside lanes that go on (:func:`symphony.roadgraph.routes.carried_on`).
+    """
+    first, count = first.copy(), count.copy()
+    length, parts, begin = max(HORIZON, drivable(segment, segment.num_steps) + ONWARD), [point], len(point)
+    ends = np.array([graph.lines[lane][-1] for lane in graph.drops], np.float32).reshape(-1, 2)
+    rows = np.argwhere(count > 1)
+    last = point[(first + count - 1)[tuple(rows.T)]]
+    for n, g in rows[(np.abs(last[:, None] - ends).max(-1) < SAME).any(-1)].tolist():
+        line = point[first[n, g] : first[n, g] + count[n, g]].astype(np.float64)
+        if (more := carried_on(graph, line, length, speed[n])) is not None:
+            # Up to where it changes a route keeps its very points.
+            same = int((more[: len(line)] == line[: len(more)]).all(-1).argmin())
+            rest = resampled(more[max(same - 1, 0) :], SPACING, length - SPACING * max(same - 1, 0))
+            parts.append(np.concatenate([line[: max(same - 1, 0)], rest]).astype(np.float32))
+            first[n, g], count[n, g], begin = begin, len(parts[-1]), begin + len(parts[-1])
+    return np.concatenate(parts), first, count
+
+
 def logged_progress(
     tables: Sequence[RouteTable], position: Float[NDArray[np.floating], "N T 2"], valid: Bool[NDArray, "N T"]
 ) -> Float[NDArray[np.float32], "N T"]:
@@ -154,6 +181,7 @@ class Routes(NamedTuple):
     point: Tensor  # [B, R, 2]
     first: Tensor  # [B, N, G] int64 place in the list of the first point of each route
     length: Tensor  # [B, N, G] int64 points of each; 0 for padding
+    followed: tuple[Tensor, Tensor]  # [B, N, G] the same of what agents follow, see :func:`followed`
 
     def of(self, scene: Int[Tensor, " M"], goal: Int[Tensor, "M N"]) -> FollowedRoutes:
         """Return the routes that agents follow: none where there is no route of that number."""
@@ -164,9 +192,7 @@ class Routes(NamedTuple):
         agent = torch.arange(agents, device=goal.device)
         # Places in the flattened [B, N, G], and then in the flattened [B, R].
         row = ((scene[:, None] * agents + agent) * number + goal.clamp(0, number - 1)).flatten()
-        first, count = (
-            part.flatten().index_select(0, row).unflatten(0, goal.shape) for part in (self.first, self.length)
-        )
+        first, count = (part.flatten().index_select(0, row).unflatten(0, goal.shape) for part in self.followed)
         exists = (goal >= 0) & (goal < number)
         begin = first + (scene * self.point.shape[1])[:, None]
         return FollowedRoutes(self.point.flatten(0, 1), begin, torch.where(exists, count, 0))

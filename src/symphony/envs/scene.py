@@ -22,7 +22,7 @@ from torch import Tensor
 from symphony.data.levels import Levels, agent_heights, levels_of
 from symphony.data.segment import AgentType, LaneType, MarkType, Polylines, RunSegment, SignalState
 from symphony.data.selection import interactive_agents
-from symphony.envs.routes import NO_ROUTES, Routes, packed, route_table
+from symphony.envs.routes import NO_ROUTES, Routes, followed, packed, route_table
 from symphony.errors import DataError
 from symphony.geometry.cells import EdgeCells, PointCells
 from symphony.geometry.nearest import spans
@@ -176,6 +176,8 @@ class SceneBatch(TensorClass):
     route_point: Tensor  # [R, 2] points of the feasible routes of the interactive agents, one after the other
     route_first: Tensor  # [N, G] int64 place of the first point of each route
     route_count: Tensor  # [N, G] int64 points of each; 0 for padding
+    follow_first: Tensor  # [N, G] the same of the line that is followed, which goes on where lanes beside it do
+    follow_count: Tensor  # [N, G]
     route_logged: Tensor  # [N] int64 the route nearest to what the log shows, -1 for none
 
     @property
@@ -186,12 +188,13 @@ class SceneBatch(TensorClass):
     @property
     def routes(self) -> Routes:
         """The feasible routes of the interactive agents."""
-        return Routes(self.route_point, self.route_first, self.route_count)
+        lines = self.follow_first, self.follow_count
+        return Routes(self.route_point, self.route_first, self.route_count, lines)
 
     def whole_route(self, scene: int, agent: int, route: int) -> Tensor:
-        """Return points [K, 2] of one route of an interactive agent."""
-        begin = int(self.route_first[scene, agent, route])
-        return self.route_point[scene, begin : begin + int(self.route_count[scene, agent, route])]
+        """Return points [K, 2] of one route of an interactive agent, as it is followed."""
+        begin = int(self.follow_first[scene, agent, route])
+        return self.route_point[scene, begin : begin + int(self.follow_count[scene, agent, route])]
 
 
 def scene(
@@ -224,6 +227,11 @@ def scene(
     if graph is not None:
         pairs = zip(chosen.tolist(), enter.tolist(), strict=True)
         tables = [route_table(segment, graph, agent, at) for agent, at in pairs]
+    point, *whole = packed(tables)
+    lines = whole
+    if graph is not None:
+        speed = np.linalg.norm(segment.velocity[chosen, enter], axis=-1)
+        point, *lines = followed(segment, graph, speed.tolist(), point, *whole)
     moving = segment.position[..., :2], segment.heading[..., None], segment.velocity
     levels = levels_of(segment)
     fields: dict[str, Any] = {
@@ -246,7 +254,8 @@ def scene(
         "dt": np.float64(segment.dt),
         **_edges(segment.road.boundary, levels),
         **_points(segment, levels),
-        **dict(zip(("route_point", "route_first", "route_count"), packed(tables), strict=True)),
+        "route_point": point,
+        **dict(zip(("route_first", "route_count", "follow_first", "follow_count"), whole + lines, strict=True)),
         "route_logged": np.array([table.logged for table in tables], np.int64),
     }
     return SceneBatch(
@@ -316,7 +325,7 @@ def with_few_steps(scenes: SceneBatch) -> SceneBatch:
 _TIMED_FIELDS = ("log_state", "log_valid", "light", "agent_height")
 _INDEX_FIELDS = ("point_light", "edge_previous", "edge_following")
 _AGENT_FIELDS = ["interactive", "interactive_valid", "enter", "background"]
-_AGENT_FIELDS += ["route_first", "route_count", "route_logged"]
+_AGENT_FIELDS += ["route_first", "route_count", "follow_first", "follow_count", "route_logged"]
 
 
 def _edges(boundary: Polylines, levels: Levels) -> dict[str, NDArray[Any]]:

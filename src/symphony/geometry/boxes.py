@@ -37,10 +37,7 @@ def meeting_time(
     Takes the way from a's centre to b's, and the speed of b relative to a, in metres per unit of time.
     """
     pair = relation(way[..., 0], way[..., 1], heading_a, heading_b)
-    gains = (
-        *turned(speed[..., 0], speed[..., 1], heading_a),
-        *turned(speed[..., 0], speed[..., 1], heading_b),
-    )
+    gains = (*turned(speed[..., 0], speed[..., 1], heading_a), *turned(speed[..., 0], speed[..., 1], heading_b))
     begin, end = torch.zeros_like(pair.in_a[0]), torch.full_like(pair.in_a[0], math.inf)
     for at, gain, cover in zip((*pair.in_a, *pair.in_b), gains, covers(pair.turn, size_a, size_b), strict=True):
         slow = gain.abs() < _SLOW
@@ -229,12 +226,7 @@ def _corner_distance(way: _Plane, turn: _Plane, size: Pairs, other_size: Pairs) 
     x_of_length, x_of_width, y_of_length, y_of_width = cos * length, sin * width, sin * length, cos * width
     near_x, far_x = x_of_length - x_of_width, x_of_length + x_of_width
     near_y, far_y = y_of_length - y_of_width, y_of_length + y_of_width
-    corners = (
-        (x + near_x, y + far_y),
-        (x - far_x, y - near_y),
-        (x - near_x, y - far_y),
-        (x + far_x, y + near_y),
-    )
+    corners = ((x + near_x, y + far_y), (x - far_x, y - near_y), (x - near_x, y - far_y), (x + far_x, y + near_y))
     squared = [
         (along.abs() - half_length).clamp(min=0).square() + (across.abs() - half_width).clamp(min=0).square()
         for along, across in corners

@@ -64,10 +64,7 @@ def distance_to(
     """Return :func:`signed_distance` where the nearest segments are known; ``valid`` ones have a length."""
     here = _Side(points, _take(start, nearest), _take(end, nearest))
     sign = here.sign
-    for neighbor, beyond, ahead in (
-        (previous, here.fraction < 0, False),
-        (following, here.fraction > 1, True),
-    ):
+    for neighbor, beyond, ahead in ((previous, here.fraction < 0, False), (following, here.fraction > 1, True)):
         # Most positions lie beside their segment; on the CPU it pays to see whether any lies past a corner.
         if neighbor is not None and not (on_host(points) and not bool(beyond.any())):
             corner = _corner_sign(points, start, end, valid, neighbor, nearest, here, ahead)
@@ -144,10 +141,7 @@ def _nearest_segment(
     batch, count, _ = points.shape
     # Coordinates relative to a point of the map keep float32 rounding well below a millimetre: halfway between the
     # outermost valid starts, 0 where there are none, so that no position has a say in it.
-    low, high = (
-        start.masked_fill(~valid[..., None], torch.inf),
-        start.masked_fill(~valid[..., None], -torch.inf),
-    )
+    low, high = (start.masked_fill(~valid[..., None], torch.inf), start.masked_fill(~valid[..., None], -torch.inf))
     center = (0.5 * (low.amin(1, keepdim=True) + high.amax(1, keepdim=True))).nan_to_num(0.0)
     x, y = (points - center)[..., None].unbind(2)
     axes = _segment_axes(start, end, valid, center)[:, :, None]

@@ -53,10 +53,7 @@ class Choice:
 
 
 def choices(
-    drawn: Int[Tensor, "B D N"],
-    kept: Int[Tensor, "B K N"],
-    turn: Int[Tensor, "B N G"],
-    founders: Float[Tensor, " B"],
+    drawn: Int[Tensor, "B D N"], kept: Int[Tensor, "B K N"], turn: Int[Tensor, "B N G"], founders: Float[Tensor, " B"]
 ) -> list[Choice]:
     """Return the effect of a search on the goals of each segment.
 

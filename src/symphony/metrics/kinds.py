@@ -165,10 +165,7 @@ def _first_met(
     before, after = poses
     seen = valid[0] & valid[0][me][:, None]
     start = torch.where(seen[..., None], before, after)
-    mine, mine_after = (
-        torch.where(seen[..., None], before[me][:, None], after[me][:, None]),
-        after[me][:, None],
-    )
+    mine, mine_after = (torch.where(seen[..., None], before[me][:, None], after[me][:, None]), after[me][:, None])
     others = valid[1] & (torch.arange(boxes.shape[1], device=agent.device) != agent[:, None])
     if height is not None:
         apart, apart_after = (levels_apart(level, level[me][:, None]) for level in height)

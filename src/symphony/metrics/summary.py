@@ -95,13 +95,7 @@ def _relative(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.floa
 
 WIDTH, FASTEST = 0.5, 45.0  # bins of speeds, and the last of them, in m/s
 _SPEEDS = round(FASTEST / WIDTH)
-_SHARES = (
-    "collision_rate",
-    "collision_rate_at_states",
-    "offroad_time",
-    "agent_collision_rate",
-    "agent_offroad_time",
-)
+_SHARES = ("collision_rate", "collision_rate_at_states", "offroad_time", "agent_collision_rate", "agent_offroad_time")
 """Percentages of which a bound is known where they are zero."""
 _ROW = (
     "collision_rate",

@@ -8,14 +8,7 @@ from symphony.imports import lazily
 
 if TYPE_CHECKING:
     from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram, inverse_cdf
-    from symphony.modules.encoder import (
-        FORESIGHT,
-        ElementGroup,
-        SceneEncoder,
-        SceneNetwork,
-        mlp,
-        scene_module,
-    )
+    from symphony.modules.encoder import FORESIGHT, ElementGroup, SceneEncoder, SceneNetwork, mlp, scene_module
     from symphony.modules.policy import (
         NoiseSampler,
         RouteScores,

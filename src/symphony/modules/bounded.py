@@ -90,13 +90,7 @@ class BoundedDisplacement(Distribution):
     has_rsample = True
 
     def __init__(
-        self,
-        loc: Pairs,
-        scale: Pairs,
-        pace: Reals,
-        slope: Reals,
-        reach: float,
-        validate_args: bool | None = None,
+        self, loc: Pairs, scale: Pairs, pace: Reals, slope: Reals, reach: float, validate_args: bool | None = None
     ) -> None:
         self.loc, self.scale, self.pace, self.slope, self.reach = loc, scale, pace, slope, reach
         super().__init__(loc.shape[:-1], loc.shape[-1:], validate_args=validate_args)

@@ -300,10 +300,6 @@ def discrete_policy(
     return ProbabilisticTensorDictSequential(
         scene_module(network, groups, logits_key, own_keys=own_keys, valid_key=valid_key),
         NoiseSampler(
-            logits_key,
-            action_key,
-            noise_key=noise_key,
-            return_log_prob=return_log_prob,
-            log_prob_key=log_prob_key,
+            logits_key, action_key, noise_key=noise_key, return_log_prob=return_log_prob, log_prob_key=log_prob_key
         ),
     )

@@ -29,11 +29,7 @@ Function = Callable[[Tensor], Tensor]  # row-wise, `[n, F] -> [n, H]`
 
 
 def pool_elements(
-    function: Function,
-    elements: Float[Tensor, "*b K F"],
-    mask: Bool[Tensor, "*b K"],
-    *,
-    mode: PoolMode = "auto",
+    function: Function, elements: Float[Tensor, "*b K F"], mask: Bool[Tensor, "*b K"], *, mode: PoolMode = "auto"
 ) -> Float[Tensor, "*b H"]:
     """Return the maximum over the valid elements of a row-wise network's outputs (paper, III-C).
 

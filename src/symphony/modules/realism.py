@@ -93,13 +93,7 @@ def discriminator(
 ) -> TensorDictModule:
     """Build a :class:`Discriminator` that reads an observation and writes its logits `[..., N]`."""
     network = Discriminator(
-        own_features,
-        object_features,
-        point_features,
-        radius=radius,
-        hidden=hidden,
-        head=head,
-        features=features,
+        own_features, object_features, point_features, radius=radius, hidden=hidden, head=head, features=features
     )
     groups = (
         encoder.ElementGroup(OBJECTS, OBJECTS_MASK, object_features),

@@ -255,14 +255,7 @@ def _own_view(trails: NDArray[Any], target: Target) -> View:
 
 
 def draw_ways(
-    axes: Axes,
-    clip: Clip,
-    rank: int,
-    color: str,
-    *,
-    width: float,
-    until: int | None = None,
-    gid: str | None = None,
+    axes: Axes, clip: Clip, rank: int, color: str, *, width: float, until: int | None = None, gid: str | None = None
 ) -> None:
     """Draw the way of one of the agents in every rollout, up to a step."""
     past = slice(None if until is None else until + 1)

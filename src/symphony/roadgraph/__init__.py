@@ -5,14 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from symphony.imports import lazily
-from symphony.roadgraph.routes import (
-    Route,
-    ground_truth_routes,
-    route_errors,
-    route_line,
-    route_lines,
-    routes,
-)
+from symphony.roadgraph.routes import Route, ground_truth_routes, route_errors, route_line, route_lines, routes
 
 if TYPE_CHECKING:
     from symphony.roadgraph.branches import lane_of, starting_lanes, visited_curvatures, visited_regions

@@ -158,6 +158,14 @@ class LaneGraph:
         return np.flatnonzero(self.usable)
 
     @cached_property
+    def drops(self) -> dict[int, tuple[int, ...]]:
+        """Lanes that end beside lanes which go on, and these: one that is to get any farther must change to them."""
+        ends = (lane for lane in self.usable_lanes.tolist() if not self.successors[lane])
+        beside = {lane: (*self.left[lane], *self.right[lane]) for lane in ends}
+        found = {lane: tuple(k for k in others if self.successors[k]) for lane, others in beside.items()}
+        return {lane: others for lane, others in found.items() if others}
+
+    @cached_property
     def index(self) -> LineIndex:
         """Spatial index over the usable lanes (line k is lane ``usable_lanes[k]``)."""
         return LineIndex([self.lines[k] for k in self.usable_lanes])

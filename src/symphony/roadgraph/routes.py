@@ -260,6 +260,35 @@ def route_lines(
     return kept, lines
 
 
+def carried_on(graph: LaneGraph, line: Reals, length: float, speed: float = 0.0) -> Reals | None:
+    """A line [P, 2] that ends with a lane beside others which go on, carried on up to a length in metres; None for
+    another line.
+
+    On that lane, :func:`change_length` or :data:`CHANGE_METRES` before its end, it changes to the nearest of those,
+    and follows the straightest lanes from there, again and again where these end beside others, too.
+    """
+    drops, found = list(graph.drops), None
+    ends = np.array([graph.lines[lane][-1] for lane in drops]).reshape(-1, 2)
+    for _ in range(MAX_LANES):
+        arc, away = paths.arc_lengths(line), np.hypot(*(ends - line[-1]).T)
+        if arc[-1] >= length or away.min(initial=np.inf) > SAME:
+            break
+        lane = drops[int(away.argmin())]
+        within = min(float(graph.length[lane]), change_length(speed), float(arc[-1]))
+        point = paths.at(line, arc, arc[-1:] - within)[0]
+        places = {other: paths.beside(graph.lines[other], point) for other in graph.drops[lane]}
+        other = min(places, key=lambda k: places[k][1])
+        rest = float(graph.length[other]) - places[other][0]
+        on = _onward(graph, rest, Route((other,)), length - float(arc[-1]) + within)
+        target, reach = paths.centre_line(graph, on.lanes, places[other][0]), max(within, CHANGE_METRES)
+        near = int(np.searchsorted(paths.arc_lengths(target), 1.5 * reach)) + 1  # it may come by here again
+        way = np.concatenate([paths.blend(target[:near], point, reach), target[near:]])
+        if places[other][1] > CHANGE_WIDTH or len(way) < 2:
+            break
+        line = found = np.concatenate([line[arc < arc[-1] - within - 1e-3], way])
+    return found
+
+
 def ends_inside(graph: LaneGraph, line: Reals) -> bool:
     """Return whether a line [P, 2] ends where the map goes on.
 

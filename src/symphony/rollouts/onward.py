@@ -51,7 +51,8 @@ class Onward:
         or are driven. Vehicles that ``enter`` are rows after those of the log, seen once: where and when they
         may first enter, each step and lane a Bernoulli draw of its own. Their sizes are those of vehicles of the log,
         their speeds those of vehicles that came in by their lane, or on the map. All is drawn from seed and segment,
-        so that rollouts, and planners that are compared, meet the same demand.
+        so that planners that are compared meet the same demand. Rollouts meet it, too: they share the rows of their
+        scene, and demand of their own would take as many times the rows, of which everyone is compared with all.
 
         Raises:
             DataError: more than :data:`MOST_ENTER` vehicles would enter.

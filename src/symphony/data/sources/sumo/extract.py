@@ -110,13 +110,7 @@ def _at_steps(traffic: Traffic) -> tuple[Traffic, Bools]:
 
 
 def _cut(
-    name: str,
-    crop: Crop,
-    tracks: Traffic,
-    unphysical: Bools,
-    start: int,
-    rng: np.random.Generator,
-    rule: CropRule,
+    name: str, crop: Crop, tracks: Traffic, unphysical: Bools, start: int, rng: np.random.Generator, rule: CropRule
 ) -> RunSegment | str:
     """Return one segment, or why there is none."""
     window = slice(start, start + rule.steps)

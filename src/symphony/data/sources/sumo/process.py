@@ -66,13 +66,7 @@ def run_program(name: str, arguments: str, folder: Path) -> None:
     environment = {**os.environ, "SUMO_HOME": str(home)}
     try:
         done = subprocess.run(  # noqa: S603 - the program comes from the installed wheel and the arguments are ours
-            command,
-            cwd=folder,
-            env=environment,
-            check=False,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_SECONDS,
+            command, cwd=folder, env=environment, check=False, capture_output=True, text=True, timeout=TIMEOUT_SECONDS
         )
     except (subprocess.TimeoutExpired, OSError) as error:
         raise DataError(f"{name} could not be run: {error}") from error
