@@ -13,9 +13,19 @@ from hypothesis import strategies as st
 from helpers_sources import RECTANGLE, ROAD, bound, driver, lanelet, obstacle, off_road, signed_area, state
 from helpers_sources import commonroad as file_of
 from helpers_sources import convert_xml as convert
+from helpers_store import fill
+from symphony.agents import load_agent
+from symphony.bench.published import pdm
+from symphony.config.evaluation import SimulateConfig
 from symphony.data.segment import MarkType, RunSegment, SignalState, content_hash
 from symphony.data.sources import get_reader
 from symphony.data.sources.lines import SLIT, drivable_rings
+from symphony.envs import scene
+from symphony.evaluation.planners import run_score
+from symphony.evaluation.report import report
+from symphony.roadgraph import LaneGraph
+from symphony.rollouts.crowd import crowd_dataset
+from symphony.saved.saving import save_simulation
 
 
 @pytest.fixture
@@ -247,3 +257,76 @@ def test_a_light_repeats_its_cycle_from_the_offset(path: Path, offset: int) -> N
 )
 def test_a_light_holds_for_its_directions(path: Path, direction: str, lanes: list[int]) -> None:
     assert convert(path, FORK, TURNS, light(0, direction), driver(7)).signal_lane.tolist() == lanes
+
+
+# Planning problems
+
+
+def problem(goal: str, number: int = 100, x: float = 5.0) -> str:
+    """The ego on the lane along +x at 8 m/s, which is to be somewhere between steps 20 and 30."""
+    times = "<time><intervalStart>20</intervalStart><intervalEnd>30</intervalEnd></time>"
+    first = state(0, x, 0.0, 0.0, 8.0, "initialState")
+    place = f"<position>{goal}</position>" if goal else ""
+    return f'<planningProblem id="{number}">{first}<goalState>{times}{place}</goalState></planningProblem>'
+
+
+AREA = "<rectangle><length>4</length><width>3</width><center><x>90</x><y>33</y></center></rectangle>"
+
+
+def forked() -> list[str]:
+    """A lane along +x that forks after 50 m: 11 goes straight on, 12 to the left."""
+    stem = lanelet(10, [(0, 2), (50, 2)], [(0, -2), (50, -2)], '<successor ref="11"/><successor ref="12"/>')
+    ahead = lanelet(11, [(50, 2), (150, 2)], [(50, -2), (150, -2)], '<predecessor ref="10"/>')
+    turn = np.radians(np.arange(0, 91, 10))
+    rings = [np.stack([50 + r * np.sin(turn), 40 - r * np.cos(turn)], -1).tolist() for r in (38, 42)]
+    return [stem, ahead, lanelet(12, *rings, '<predecessor ref="10"/>')]
+
+
+def problems_of(path: Path, *parts: str) -> list[RunSegment]:
+    path.write_text(file_of(*parts))
+    return [one for one in get_reader("commonroad", egos="problem").read(path) if isinstance(one, RunSegment)]
+
+
+@pytest.mark.parametrize(("goal", "place", "lane"), [
+    ('<lanelet ref="11"/>', (100, 0), 11),
+    ('<lanelet ref="12"/>', (50 + 40 * np.sin(np.pi / 4), 40 - 40 * np.cos(np.pi / 4)), 12),
+    (AREA, (90, 33), 12),
+    ("<point><x>140</x><y>1</y></point>", (140, 1), 11),
+])  # fmt: skip
+def test_the_ego_of_a_planning_problem_is_on_its_way_to_the_goal(path, tmp_path, goal, place, lane):
+    (segment,) = problems_of(path, *forked(), driver(7, x=30.0), problem(goal))
+    assert (segment.segment_id, segment.group) == ("ZAM_Made-1_1_T-1_problem100", "ZAM_Made-1_1_T-1")
+    assert (segment.agent_id.tolist(), segment.ego, segment.num_steps) == ([100, 7], 0, 31)
+    # It has no log but its first state.
+    assert segment.valid[0].tolist() == [True] + [False] * 30
+    assert segment.velocity[0, 0].tolist() == [8, 0]
+    np.testing.assert_allclose(segment.size[0], [4.508, 1.61, 0])
+    np.testing.assert_allclose(segment.position[0, 0] + segment.origin, [5, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(segment.goal + segment.origin[:2], place, atol=0.2)
+    store = fill(tmp_path / "store", [segment])
+    assert (store[0].goal, store.tags(0)) == (segment.goal, {})
+    made = scene(store[0], [0], LaneGraph(segment.road))
+    end = made.whole_route(0, 0, int(made.route_logged[0, 0]))[-1].numpy() + segment.origin[:2]
+    np.testing.assert_allclose(end, {11: (150, 0), 12: (90, 40)}[lane], atol=0.1)
+    # A planner drives it there; what is measured against a log is not defined.
+    agent = load_agent("playback")
+    config = SimulateConfig(rollouts=1)
+    dataset = crowd_dataset(store, agent, config, default=1, routes=True)
+    saved = save_simulation(tmp_path / "sim", agent, dataset, config, planner="idm")
+    (row,) = report(saved, "ego").rows
+    assert (row["failed"], row["collision"], row["offroad_time"]) == ("", False, 0)
+    assert row["progress"] > 20
+    assert [row["progress_ratio"], row["log_distance"], run_score(row), pdm(row, saved[0], [])] == [None] * 4
+
+
+def test_planning_problems_are_a_segment_each_and_wrong_ones_are_named(path):
+    found = problems_of(path, *forked(), driver(7), problem("", 8), problem('<lanelet ref="11"/>', 9, 30.0))
+    assert [(one.segment_id[16:], one.goal is None) for one in found] == [("_problem8", True), ("_problem9", False)]
+    for parts, why in (
+        ([driver(7)], "planningProblem: missing"),
+        ([problem('<lanelet ref="13"/>')], "names lanelet 13, which is no lane"),
+        ([problem("").replace("initialState", "noState")], "planningProblem 100: initialState: missing"),
+    ):
+        path.write_text(file_of(*forked(), *parts))
+        (error,) = get_reader("commonroad", egos="problem").read(path)
+        assert why in str(error)

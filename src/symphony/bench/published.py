@@ -65,7 +65,7 @@ def pdm(run: Mapping[str, Any], saved: SavedRollouts, collisions: list[int]) -> 
     if run["failed"] or run["offroad_time"] is None:
         return None
     segment, ratio = saved.segment, run["progress_ratio"]
-    if ratio is None and (run["beyond_route"] or run["no_route"]):
+    if ratio is None and (run["beyond_route"] or run["no_route"] or not run["logged_steps"]):
         return None
     # Where the log makes no progress there is none to make.
     stands = ratio is None or (ratio > 0 and abs(run["progress"] / ratio) < STANDS)

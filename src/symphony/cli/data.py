@@ -155,9 +155,10 @@ class Convert(shared.Command):
     rate: Positive = 5.0  # Steps per second in the store (the paper's 5).
     interactive: Count = 2  # Interactive agents a run segment must have at its first step.
     smooth: NotNegative = 0.0  # Smoothing of the tracks before they are resampled: its sigma in seconds.
-    #: Egos of each scenario of CommonRoad or window of INTERACTION, which name none: `one`, that with the most moving
-    #: vehicles around it, or `all` moving vehicles seen throughout, with a run segment each.
-    egos: Literal["one", "all"] = "one"
+    #: Egos of each scenario of CommonRoad or window of INTERACTION: `one`, that with the most moving vehicles around
+    #: it, or `all` moving vehicles seen throughout, with a run segment each; `problem`: of each planning problem of
+    #: CommonRoad, without a log.
+    egos: Literal["one", "all", "problem"] = "one"
     window: Positive = 10.0  # Seconds of the run segments that recordings of INTERACTION are cut into.
     #: Seconds between the starts of two windows of INTERACTION; without it, one begins where another ends.
     stride: Annotated[float | None, Bounds(sys.float_info.min)] = None

@@ -50,11 +50,7 @@ class AgentConfig(Settings):
     encoder: Own = "paper"
     #: Policy: `paper`, or the import path of a function from an `AgentSpec` to a policy module.
     policy: Own = "paper"
-    GONE: ClassVar = {
-        "num_objects": 16,
-        "persona": False,
-        "head": lambda values: 2 * values.get("hidden", 64),
-    }
+    GONE: ClassVar = {"num_objects": 16, "persona": False, "head": lambda values: 2 * values.get("hidden", 64)}
 
     def __post_init__(self) -> None:
         super().__post_init__()

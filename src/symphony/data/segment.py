@@ -200,6 +200,9 @@ class RunSegment:
     #: what is unusual, or was left out (see :mod:`symphony.data.odd`): kind -> example. A store keeps it as a tag.
     #: Not part of the content hash.
     odd: Mapping[str, str] = field(default_factory=dict, metadata={"hashed": False})
+    #: x, y where the ego is to come past, which its log does not show (a planning problem of CommonRoad). A store
+    #: keeps it as a tag. Not part of the content hash.
+    goal: list[float] | None = field(default=None, metadata={"hashed": False})
     #: steps of the log where the segment goes on past it (:mod:`symphony.rollouts.onward`); 0 where all are. Not part
     #: of the content hash, and never in a store.
     logged: int = field(default=0, metadata={"hashed": False})
@@ -293,6 +296,8 @@ def _checks(s: RunSegment) -> Iterator[Check]:
     yield from _array("interest", s.interest, (len(s.interest),), np.int32, agents)
     yield from _array("predict", s.predict, (len(s.predict),), np.int32, agents)
     yield from _array("origin", s.origin, (3,), np.float64)
+    place = s.goal is None or (np.shape(s.goal) == (2,) and largest(np.array(s.goal)) < MAX_COORDINATE)
+    yield "goal", place, "must be None or x and y, near the origin"
     yield "logged", 0 <= s.logged <= steps, f"{s.logged} outside the {steps} steps"
     yield "current_step", 0 <= s.current_step < steps, f"{s.current_step} outside the {steps} steps"
     sides = MIN_SIZE, MAX_SIZE

@@ -22,8 +22,8 @@ from symphony.data.store_format import MAPS, REPORT, SEGMENTS, Table, check_head
 from symphony.errors import DataError
 
 TWICE = "a segment of this name is in the store already"
-GROUP, NETWORK = "group", "network"
-"""Tags under which a segment's group is kept: in this release, and by the generator before there were groups."""
+GROUP, GOAL, NETWORK = "group", "goal", "network"
+"""Tags under which a segment's group (also by the generator before there were groups) and its goal are kept."""
 
 
 class SegmentStore(Sequence[RunSegment]):
@@ -86,7 +86,9 @@ class SegmentStore(Sequence[RunSegment]):
         agents, steps, lights = len(parts["agent_id"]), int(record["steps"]), len(parts["signal_lane"])
         for name in ("segment_id", "source", "file"):
             parts[name] = self._text(parts[name], row, name)
-        parts["group"] = _group(self._parsed(row, parts.pop("tags")), parts["segment_id"])
+        tags = self._parsed(row, parts.pop("tags"))
+        parts["group"] = _group(tags, parts["segment_id"])
+        parts["goal"] = tags.get(GOAL)
         for name in ("position", "heading", "velocity", "valid"):
             parts[name] = parts[name].reshape(agents, steps, *parts[name].shape[1:])
         parts["signal_state"] = parts["signal_state"].reshape(lights, steps)
@@ -208,7 +210,7 @@ class SegmentStore(Sequence[RunSegment]):
         """Return what was given as ``tags`` when the segment was appended."""
         row = self._row(index)
         found = self._parsed(row, self.raw(SEGMENTS, row)[1]["tags"])
-        return {name: value for name, value in found.items() if name != GROUP}
+        return {name: value for name, value in found.items() if name not in (GROUP, GOAL)}
 
     def _parsed(self, row: int, tags: Any) -> dict[str, Any]:
         try:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from symphony.data import store_format as layout
 from symphony.data.segment import RunSegment, content_hash, validate
-from symphony.data.store import GROUP, TWICE, SegmentStore
+from symphony.data.store import GOAL, GROUP, TWICE, SegmentStore
 from symphony.data.store_format import MAPS, SEGMENTS, Table
 from symphony.errors import DataError
 from symphony.files import Lock, naming, write_json
@@ -64,15 +64,16 @@ class StoreWriter(AbstractContextManager["StoreWriter"]):
     def append(self, segment: RunSegment, *, tags: Mapping[str, Any] | None = None) -> int:
         """Add one segment and return its index; a :class:`DataError` if it breaks the schema or its name is taken.
 
-        Tags are anything JSON can hold, given back by :meth:`SegmentStore.tags`; not under the name ``group``, where
-        the segment's group is kept.
+        Tags are anything JSON can hold, given back by :meth:`SegmentStore.tags`; not under the names ``group`` and
+        ``goal``, where the segment's are kept.
         """
         segment = _plain(validate(segment))
-        if tags and GROUP in tags:
-            raise DataError(f"{GROUP!r} cannot name a tag", segment=segment.segment_id, field="tags")
+        if wrong := {GROUP, GOAL} & (tags or {}).keys():
+            raise DataError(f"{min(wrong)!r} cannot name a tag", segment=segment.segment_id, field="tags")
         # Not a column of its own: older stores and releases have none.
         known = segment.group not in {"", segment.segment_id}
         noted = {**(tags or {}), **({GROUP: segment.group} if known else {})}
+        noted |= {} if segment.goal is None else {GOAL: segment.goal}
         values = {c.name: getattr(segment, c.name) for c in SEGMENTS.columns if c.name != "tags"}
         values["tags"] = json.dumps(noted, ensure_ascii=False) if noted else ""
         for name in ("segment_id", "source", "file", "tags"):

@@ -79,8 +79,8 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
     the log, and reach :data:`ONWARD` metres beyond what can be driven in the segment, unless the map ends. Where they
     can't be built, a :class:`~symphony.errors.DataWarning` says so, and there are none.
 
-    Routes begin with the agent's first valid state from step ``begin``, at which it enters, on; those of an agent
-    that enters later with its first state on a lane.
+    An ego with a goal took one that comes past it. Routes begin with the agent's first valid state from step
+    ``begin``, at which it enters, on; those of an agent that enters later with its first state on a lane.
     """
     steps, starts, first = begin + np.flatnonzero(segment.valid[agent, begin:]), [], 0
     for first in steps.tolist() if begin else steps[:1].tolist():
@@ -100,7 +100,10 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
         return NO_ROUTES
     if not lines:
         return NO_ROUTES
-    right = ground_truth_routes(lines, segment.position[agent, first:, :2], segment.valid[agent, first:])
+    path, there = segment.position[agent, first:, :2], segment.valid[agent, first:]
+    if segment.goal is not None and agent == segment.ego:
+        path, there = np.concatenate([path, [segment.goal]]), np.append(there, True)
+    right = ground_truth_routes(lines, path, there)
     tied = np.flatnonzero(right)
     draw = stream_of(f"route {segment.segment_id} {segment.agent_id[agent]}") % len(tied)
     count = np.array([len(line) for line in lines], np.int64)

@@ -26,7 +26,7 @@ COLUMNS = {
     "failed_runs": ("failed", 0),
 }
 """Numbers of the table, their headings and digits."""
-_ABOUT = ("segment", "rollout", "group", "failed", "progress_ratio", "beyond_route", "no_route")
+_ABOUT = ("segment", "rollout", "group", "failed", "progress_ratio", "beyond_route", "no_route", "logged_steps")
 _RUN = (*_ABOUT, "collision", "at_fault_collision", "red_lights", "offroad_time")  # of each run, in a record
 _FREE = ("planner", "planner_seconds", "rollouts")
 """Settings of the planner itself, and of how often it is tried."""
@@ -39,12 +39,13 @@ Record = dict[str, Any]
 def run_score(run: Mapping[str, Any]) -> float | None:
     """Return 0 to 100 for a run: the progress relative to the log's, at most all of it; 0 for one that failed, with a
     collision at fault, a red light, or time off the road. 100 where the log stays in place, as there is no progress
-    to make; None where progress is not defined: beyond a route that ends inside the map, or without a route.
+    to make; None where progress is not defined: beyond a route that ends inside the map, without a route or a log.
     """
     if run["failed"] or run["at_fault_collision"] or run["red_lights"] or run["offroad_time"]:
         return 0.0
     if run["progress_ratio"] is None:
-        return None if run["beyond_route"] or run["no_route"] else 100.0
+        unknown = run["beyond_route"] or run["no_route"] or not run.get("logged_steps", 1)
+        return None if unknown else 100.0
     return 100.0 * min(max(float(run["progress_ratio"]), 0.0), 1.0)
 
 

@@ -83,10 +83,7 @@ class Report:
             minutes, share = part["seconds"] / 60, _percent(np.array(part["offroad"]), part["seconds"])
             numbers = {"agent_minutes": minutes, "offroad_time": share}
             for kind in ("collisions", "red_lights"):
-                numbers |= {
-                    kind: int(part[kind]),
-                    f"{kind}_per_minute": part[kind] / minutes if minutes else None,
-                }
+                numbers |= {kind: int(part[kind]), f"{kind}_per_minute": part[kind] / minutes if minutes else None}
             found[name] = numbers
         return found
 

@@ -326,11 +326,7 @@ class SceneDataset:
     def fitted(self, items: Sequence[int], scenes: SceneBatch) -> Fitted:
         """Return the motion of the interactive agents of some segments, as fitted to the action space."""
         state, valid = logged(scenes)
-        state, progress, known = (
-            state.clone(),
-            torch.zeros_like(state[..., 0]),
-            torch.zeros_like(valid[:, 1:]),
-        )
+        state, progress, known = (state.clone(), torch.zeros_like(state[..., 0]), torch.zeros_like(valid[:, 1:]))
         action = torch.zeros_like(state[:, 1:, ..., :2])
         action = action[..., 0].long() if self.dynamics.discrete else action
         for b, expert in enumerate(self.experts.many(items)):
@@ -357,10 +353,7 @@ class Fitted(NamedTuple):
 
 
 def transitions(
-    data: SceneDataset,
-    items: Sequence[int] | None = None,
-    observation: ObservationConfig | None = None,
-    **how: Any,
+    data: SceneDataset, items: Sequence[int] | None = None, observation: ObservationConfig | None = None, **how: Any
 ) -> TensorDict:
     """Return the driving of the interactive agents in logs as steps of a :class:`DrivingEnv`: for replay buffers.
 
@@ -394,10 +387,7 @@ def transitions(
 
 
 def _seen_routes(
-    experts: Sequence[Experts],
-    row: Int[Tensor, " M"],
-    progress: Float[Tensor, " M"],
-    state: Float[Tensor, "M 4"],
+    experts: Sequence[Experts], row: Int[Tensor, " M"], progress: Float[Tensor, " M"], state: Float[Tensor, "M 4"]
 ) -> RouteWindow:
     """Return the part that experts see of their routes, from states that may lie beside where they were."""
     taken = logged_routes([table for expert in experts for table in expert.routes], row)

@@ -7,13 +7,7 @@ from typing import TYPE_CHECKING
 from symphony.imports import lazily
 
 if TYPE_CHECKING:
-    from symphony.wosac.evaluate import (
-        WosacEvaluation,
-        evaluate_wosac,
-        log_playback,
-        wosac_scenario,
-        wosac_window,
-    )
+    from symphony.wosac.evaluate import WosacEvaluation, evaluate_wosac, log_playback, wosac_scenario, wosac_window
     from symphony.wosac.files import read_rollouts, score_files
     from symphony.wosac.records import logged_scenario
     from symphony.wosac.scorer import CHALLENGES, SimulatedRollouts, WosacScenario, score

@@ -28,14 +28,7 @@ from symphony.evaluation.evaluator import BASELINES
 from symphony.metrics import OrderStatistics, order_statistics, passing_gap
 from symphony.metrics.intervals import clustered_mean
 from symphony.rollouts.workers import shared
-from symphony.wosac.scorer import (
-    CHALLENGES,
-    SimulatedRollouts,
-    WosacConfig,
-    WosacScenario,
-    check_scored,
-    score,
-)
+from symphony.wosac.scorer import CHALLENGES, SimulatedRollouts, WosacConfig, WosacScenario, check_scored, score
 from symphony.wosac.scorer.config import CURRENT, DT, FUTURE, ROLLOUTS
 from symphony.wosac.simulate import constant_velocity, wosac_rollouts
 

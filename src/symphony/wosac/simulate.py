@@ -263,11 +263,7 @@ def _extrapolated(segment: RunSegment, rows: NDArray[np.int64], future: int) -> 
 
 
 def _driven(
-    agent: Agent,
-    start: RunSegment,
-    vehicles: NDArray[np.int64],
-    settings: WosacSettings,
-    log: RunSegment | None,
+    agent: Agent, start: RunSegment, vehicles: NDArray[np.int64], settings: WosacSettings, log: RunSegment | None
 ) -> Doubles:
     """Return [R, U, N, 3] x, y, heading of the vehicles; on the routes of the log, where there is one."""
     graph = LaneGraph(start.road) if agent.routed else None

@@ -5,6 +5,8 @@ all else here, and the last that installs (2022.1) brings scipy and does not ref
 
 - ``segment_id`` and ``group`` are the benchmark id. Steps run from the first to the last at which any dynamic
   obstacle exists. Coordinates are relative to the first position, in whole metres, of the ego ``egos="one"`` picks.
+- With ``egos="problem"`` the ego is that of a planning problem: it begins as the problem says, with the size of a
+  BMW 320i (vehicle 2 of CommonRoad's models), has no log but this state, and is to come past the middle of the goal.
 - States are exact: predicted ones (intervals, regions, occupancies) are not logged motion. The velocity is the logged
   speed along the logged orientation, or a difference of positions where none is logged. Static obstacles are at rest;
   scenery (buildings, pillars, road boundaries, median strips) is left out.
@@ -40,6 +42,7 @@ NO_OBSTACLE = "an obstacle left out that can't be read"
 NO_LANELET = "a lanelet left out that can't be read"
 NO_LIGHT = "a traffic light left out that can't be read"
 NO_SIGN = "a traffic sign left out that can't be read"
+STANDARD = (4.508, 1.610)  # metres of the ego of a planning problem
 MAX_REFERENCES = 200  # references of one kind in a lanelet; junctions have a handful
 MAX_CYCLE = 10**8  # steps in one cycle of a traffic light: more would not fit the arithmetic
 
@@ -72,16 +75,16 @@ class CommonRoadReader(Reader):
         egos: ``"one"`` picks, among the dynamic vehicles that move and are observed at every step, the one with
             the most moving neighbours (within 50 m, summed over the steps; the lowest id on ties). ``"all"``
             yields a segment for each of those vehicles, in order of id, with ``_ego<ID>`` added to its name; all
-            in one frame, on one map.
+            in one frame, on one map. ``"problem"`` yields one for each planning problem, with ``_problem<ID>`` added.
 
-    Raises a :class:`ConfigError` where ``egos`` is neither.
+    Raises a :class:`ConfigError` where ``egos`` is none of these.
     """
 
     name = "commonroad"
     patterns = ("*.xml",)
 
-    def __init__(self, egos: Literal["one", "all"] = "one") -> None:
-        base.check_choice("egos", egos, "one", "all")
+    def __init__(self, egos: Literal["one", "all", "problem"] = "one") -> None:
+        base.check_choice("egos", egos, "one", "all", "problem")
         self.egos = egos
 
     def _read(self, path: Path) -> Iterator[Item]:
@@ -91,15 +94,19 @@ class CommonRoadReader(Reader):
         refuse(version not in VERSIONS, f"{version!r}, expected {' or '.join(VERSIONS)}", "commonRoadVersion")
         refuse(not name, "missing", "benchmarkID")
         with located(segment=name):
-            yield from self._segments(root, name, path)
+            problems = root.findall("planningProblem") if self.egos == "problem" else [None]
+            refuse(not problems, "missing", "planningProblem")
+            for problem in problems:
+                yield from self._segments(root, name, path, problem)
 
-    def _segments(self, root: ET.Element, name: str, path: Path) -> Iterator[Item]:
+    def _segments(self, root: ET.Element, name: str, path: Path, problem: ET.Element | None) -> Iterator[Item]:
         dt = base.number(root.get("timeStepSize"), "timeStepSize")
         refuse(dt <= 0, f"must be positive, is {dt:g}", "timeStepSize")
         odd: dict[str, str] = {}
-        agents, table, valid, dynamic, first_step = _tracks(root, dt, odd)
-        position = table[..., 1:3]
-        candidates = base.busiest_first(agents["agent_id"], agents["agent_type"], position, valid, dynamic)
+        agents, table, valid, dynamic, first_step = _tracks(root, dt, odd, problem)
+        position, candidates = table[..., 1:3], np.zeros(1, np.int64)
+        if problem is None:
+            candidates = base.busiest_first(agents["agent_id"], agents["agent_type"], position, valid, dynamic)
         refuse(not len(candidates), "no moving vehicle is observed at every step", "dynamicObstacle")
         ego = int(candidates[0])
         origin = np.round(position[ego, np.argmax(valid[ego])])
@@ -117,11 +124,40 @@ class CommonRoadReader(Reader):
             group=name,
             odd=odd,
         )
-        yield from by_ego(segment, candidates, self.egos)
+        if problem is None:
+            yield from by_ego(segment, candidates, self.egos)
+        else:
+            yield segment.replace(segment_id=f"{name}_problem{agents['agent_id'][0]}", goal=_goal(problem, segment))
 
 
-def _tracks(root: ET.Element, dt: float, odd: Odd) -> tuple[dict[str, Any], Doubles, Bools, Bools, int]:
-    """Return all obstacles of either version, over the steps any dynamic one is present at.
+def _problem(node: ET.Element) -> tuple[int, int, Doubles, Box]:
+    """Return the ego of a planning problem, as :func:`_obstacle` does."""
+    name, first = f"planningProblem {node.get('id')}", node.find("initialState")
+    refuse(first is None, "missing", f"{name}: initialState")
+    log = np.array([_state(child, name, True) for child in node.findall("initialState")], np.float64)[:1]
+    return base.integer(node.get("id"), "planningProblem id"), AgentType.VEHICLE, log, (STANDARD, np.zeros(2), 0.0)
+
+
+def _goal(node: ET.Element, segment: RunSegment) -> list[float] | None:
+    """Return where the first goal with a place has its middle, in the segment's frame; None if none has one."""
+    field = f"planningProblem {node.get('id')}: goalState"
+    for place in node.findall("goalState/position"):
+        for lane in _references(place, "lanelet", field):
+            rows = np.flatnonzero(segment.road.lane_id == lane)
+            refuse(not len(rows), f"names lanelet {lane}, which is no lane", field)
+            line = segment.road.lanes[int(rows[0])][:, :2].astype(np.float64)
+            return list(lines.evenly(line, 3)[1].tolist())
+        point = place.find("point")
+        middle = _shape(place, field, "")[1] if point is None else np.array(_point(point, field))
+        return list((middle - segment.origin[:2]).tolist())
+    return None
+
+
+def _tracks(
+    root: ET.Element, dt: float, odd: Odd, problem: ET.Element | None
+) -> tuple[dict[str, Any], Doubles, Bools, Bools, int]:
+    """Return all obstacles of either version, over the steps any dynamic one is present at; before them the ego of a
+    planning problem, whose goals' times count, too.
 
     Gives ids, types and sizes, states [A, T, 6] (see :func:`_state`, with a velocity in place of speeds), where they
     are valid [A, T], which obstacles [A] are dynamic, and the format's first time step.
@@ -133,10 +169,12 @@ def _tracks(root: ET.Element, dt: float, odd: Odd) -> tuple[dict[str, Any], Doub
     nodes.sort(key=lambda entry: not entry[1])
     read = [(readable(NO_OBSTACLE, odd, _obstacle, node, moves), moves) for node, moves in nodes]
     found = [(*each, moves) for some, moves in read for each in some]
+    if problem is not None:
+        found.insert(0, (*_problem(problem), True))
     logs = [log for _, _, log, _, moves in found if moves]
     refuse(not logs, odd.get(NO_OBSTACLE, "has no dynamic obstacles"), "dynamicObstacle")
     first = min(int(log[:, 0].min()) for log in logs)
-    steps = max(int(log[:, 0].max()) for log in logs) - first + 1
+    steps = max([int(log[:, 0].max()) for log in logs] + _times(problem)) - first + 1
     schema.check_counts(len(found), steps, "time")
     table, valid = np.full((len(found), steps, 6), np.nan), np.zeros((len(found), steps), np.bool_)
     size = np.zeros((len(found), 3))
@@ -158,6 +196,13 @@ def _tracks(root: ET.Element, dt: float, odd: Odd) -> tuple[dict[str, Any], Doub
         "size": base.to_float32(size),
     }
     return agents, table, valid, np.array([each[-1] for each in found], np.bool_), first
+
+
+def _times(problem: ET.Element | None) -> list[int]:
+    """Return the last time steps of the goals of a planning problem."""
+    ways = ("goalState/time/intervalEnd", "goalState/time/exact")
+    nodes = [] if problem is None else [node for way in ways for node in problem.findall(way)]
+    return [base.integer(node.text, "planningProblem: time") for node in nodes]
 
 
 def _text(node: ET.Element, tag: str) -> str:
@@ -231,8 +276,8 @@ def _rotated(vectors: Doubles, angle: Doubles | float) -> Doubles:
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def _shape(node: ET.Element, field: str) -> Box:
-    parts = node.findall("shape/*")
+def _shape(node: ET.Element, field: str, below: str = "shape/") -> Box:
+    parts = node.findall(f"{below}*")
     known = [part for part in parts if part.tag in {"rectangle", "circle", "polygon"}]
     refuse(len(parts) != 1 or parts != known, "expected one rectangle, circle or polygon", field)
     (part,) = parts

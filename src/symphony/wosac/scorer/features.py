@@ -174,9 +174,7 @@ def speed(*coordinates: Float[Tensor, "*batch T"]) -> Float[Tensor, "*batch T"]:
     return squared.double().sqrt().to(squared.dtype) / DT
 
 
-def angular(
-    heading: Float[Tensor, "*batch T"],
-) -> tuple[Float[Tensor, "*batch T"], Float[Tensor, "*batch T"]]:
+def angular(heading: Float[Tensor, "*batch T"]) -> tuple[Float[Tensor, "*batch T"], Float[Tensor, "*batch T"]]:
     """Return (rad/s, rad/s²); each difference over two steps is taken the short way round."""
     turn = wrap(central_difference(heading) * 2) / 2
     return turn / DT, wrap(central_difference(turn) * 2) / 2 / (DT * DT)
