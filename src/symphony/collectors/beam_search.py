@@ -278,28 +278,36 @@ class Simulation:
         env = self.whole if now.shape == self.shape else branched_env(self.env, now.shape)
         recall(env, now)
         # Policy and environment write into the TensorDict they are given.
-        now, records, scores, ends, came = now.copy(), [], [], [ended], None
+        now, records, scores, ends, states = now.copy(), [], [], [ended], []
         for _ in range(length):
             now = now if self.step is _step else _ordered(now.exclude(*self.written), self.start)
             kept, now, worth, end = self.step(env, self.policy, self.score, self.keep, now)
             records.append(kept)
             scores.append(worth)
-            if self.value is not None:  # the states in which episodes ended, or that they have come to
-                over = torch.stack(ends).any(0).all(-1) & self.until_done
-                came = now.copy() if came is None else torch.where(over, came, now)
             ends.append(end)
-        joined, ahead = torch.stack(scores, -2), None
-        if came is not None and self.value is not None:
-            terminated = _ended(self.env, came, came.ndim, "terminated").all(-1) & self.until_done
-            ahead = torch.where(terminated, 0.0, self.value(came))
+            states += [] if self.value is None else [now.copy()]
+        joined = torch.stack(scores, -2)
         if not self.until_done:
             alive = torch.ones(*joined.shape[:-1], 1, dtype=torch.bool, device=joined.device)
-            return Run(records, joined, alive, ended, now, ahead)
+            return Run(records, joined, alive, ended, now, None if self.value is None else self.value(now))
         over = torch.stack(ends, -2).cumsum(-2) > 0
+        ahead = None if self.value is None else self._worth(self.value, states, over.all(-1))
         alive = ~over[..., :-1, :]
         if alive.shape[-1] not in (1, joined.shape[-1]):
             alive = alive.any(-1, keepdim=True)
         return Run(records, torch.where(alive, joined, 0.0), alive, over[..., -1, :], now, ahead)
+
+    def _worth(
+        self, value: Score, states: Sequence[TensorDictBase], over: Bool[Tensor, "*b S _"]
+    ) -> Float[Tensor, "*b S"]:
+        """Return the values of the states that branches came to, or ended in: 0 if that terminated their episodes."""
+        came, steps = states[-1], len(states)
+        if bool(over[..., -1].any()):
+            last = (~over[..., 1:]).sum(-1).clamp_max(steps - 1)
+            first = torch.arange(0, last.numel() * steps, steps, device=last.device).reshape(last.shape)
+            came = take(TensorDict.stack(states, last.ndim), first + last)
+        terminated = _ended(self.env, came, over.ndim - 1, "terminated").all(-1)
+        return torch.where(terminated, 0.0, value(came))
 
     def total(self, run: Run, length: int | None = None) -> Float[Tensor, "*b S"]:
         """Return the totals of a period, or of its first steps alone."""

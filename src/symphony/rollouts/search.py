@@ -204,7 +204,7 @@ def search(
             TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
             realism_score(env, discriminator, score=score, planned=planned) if value is None else no_score,
             start,
-            value=value,
+            value=None if value is no_value else value,
             prune_last=value is None,
             steps=steps,
             prune_every=prune_every,
