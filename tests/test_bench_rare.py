@@ -158,7 +158,7 @@ def test_what_a_rate_is_worth_is_said():
 def test_a_hunt_says_no_zero_for_what_it_does_not_know(store, tmp_path, capsys):
     plan = "def plan(s):\n    if '001000-f0-w09' in s.segment_id: raise ValueError('flat tyre')\n    return 0, 0\n"
     (tmp_path / "fails.py").write_text(plan)
-    words = f"hunt pretrained:bc_ts_h --data {store} --trees 4 --branches 2 --out x".split()
+    words = f"hunt pretrained:bc_ts_h --data {store} --trees 4 --branches 2 --duration 2 --out x".split()
 
     def told(planner, segment, out, *more):
         words[-1] = str(tmp_path / out)

@@ -116,8 +116,8 @@ def test_ray(example: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("RAY_worker_niceness", "0")  # 15 by default: on a busy machine they would hardly run
     machines = example("many_machines")
-    path = {"env_vars": {"PYTHONPATH": os.pathsep.join(sys.path)}}
-    ray.init(num_cpus=2, include_dashboard=False, runtime_env=path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    ray.init(num_cpus=2, include_dashboard=False)
     try:
         tasks = Counted(20)
         results = ordered_map(slow_square, tasks, workers=2, engine="ray")
@@ -195,7 +195,7 @@ def test_every_cell_of_the_notebook_runs_and_is_kept_without_output(tmp_path, mo
 def test_demo(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
     """With fewer updates, rollouts and segments than a newcomer gets, over what an earlier demo has left."""
     for split in ("train", "test"):
-        brief(tmp_path / split, (3, 9, 15), split=split)
+        brief(tmp_path / split, (3, 9, 15), 16, split)
     folders = {split: tmp_path / split for split in ("train", "test")}
     monkeypatch.setattr("symphony.data.builtin.builtin_store", folders.__getitem__)
     earlier = tmp_path / "demo" / "bc_h"

@@ -251,7 +251,7 @@ def test_measures_do_not_depend_on_which_way_north_is(altered: Any, segments: li
 
 
 BUILT_IN: tuple[Literal["train", "test"], ...] = ("train", "test")
-RULE = sumo.CropRule(focuses=3, per_focus=4)
+RULE = sumo.CropRule(focuses=2, per_focus=3)
 
 
 @pytest.fixture(scope="module")

@@ -43,14 +43,14 @@ def config(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
 
 def written(path: Path, *steps: int) -> Path:
     """Write a store of segments of some steps; one vehicle comes into sight after the start."""
-    late = hide(crossing(5, seed=1, steps=steps[2]), 3, slice(0, 4))
+    late = hide(crossing(5, seed=1, steps=steps[2]), 3, slice(0, 2))
     fill(path, [straight_road(4, seed=0, steps=steps[0]), crossing(4, seed=0, steps=steps[1]), late])
     return path
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return written(tmp_path_factory.mktemp("data") / "store", 6, 6, 8)
+    return written(tmp_path_factory.mktemp("data") / "store", 4, 4, 5)
 
 
 @pytest.fixture(scope="module")

@@ -28,13 +28,13 @@ from symphony.rollouts.search import search
 from test_modules_displacement import GROUPS
 
 PLAN, SEEN = "noise_plan", [OWN, OBJECTS, POINTS]
-STEPS = 5
+STEPS = 3
 SEES = ObservationConfig(num_objects=4, num_points=20, clearance=True)
 
 
 def world(*agents):
-    """In float64: a crossing of 6 steps and a road of 4, with as many interactive agents as given for each."""
-    segments = (crossing(4, steps=7, seed=1), straight_road(4, steps=5))
+    """In float64: a crossing of 4 steps and a road of 2, with as many interactive agents as given for each."""
+    segments = (crossing(4, steps=5, seed=1), straight_road(4, steps=3))
     scenes = [scene(s, list(range(n))) for s, n in zip(segments, agents or (2, 2), strict=False)]
     exact = collate(scenes).apply(lambda t: t.double() if t.is_floating_point() else t)
     return DrivingEnv(exact, Displacement(), SEES)
@@ -101,9 +101,9 @@ def test_it_is_the_mean_cost_of_what_the_actor_drives_into(env, cost):
     score = by_hand(env, actor(), realism(), td)[1]
     d = score.sigmoid()
     costs = {"log_d": d.log(), "non_saturating": -(1 - d).log(), "logit": score}[cost]
-    # The road ends after four steps.
+    # The road ends after two steps.
     counted = torch.ones(2, STEPS, 2, dtype=torch.bool)
-    counted[1, 4:] = False
+    counted[1, 2:] = False
     of = costs[counted]
     for reduction, value in (
         ("mean", of.mean()),
@@ -117,7 +117,7 @@ def test_it_is_the_mean_cost_of_what_the_actor_drives_into(env, cost):
 
 @pytest.mark.parametrize("arguments", [{}, {"cost": "logit"}])
 def test_gradients_by_differences(env, arguments):
-    td, loss, eps = planned(env, steps=5), make(env, **arguments), 1e-6
+    td, loss, eps = planned(env), make(env, **arguments), 1e-6
     pairs = list(zip(loss.parameters(), value_and_gradient(loss, td)[1], strict=True))
     for weight, gradient in pairs[::5]:
         at, values = gradient.abs().argmax(), []
@@ -154,7 +154,7 @@ def test_cut_at_every_step_it_is_the_sum_of_single_steps(env):
     cut = make(env, reduction="sum", truncate=1)
     assert_same(value_and_gradient(cut, td), total)
     whole = value_and_gradient(make(env, reduction="sum"), td)
-    for truncate in (1, 3):
+    for truncate in (1, 2):
         other = value_and_gradient(make(env, reduction="sum", truncate=truncate), td)
         assert_other_gradient(whole, other, by=1e-3)
     assert_same(value_and_gradient(make(env, reduction="sum", truncate=STEPS), td), whole)
@@ -194,7 +194,7 @@ def test_scenes_padding_and_batches_add_up():
     assert not td[VALID].all()
     both = value_and_gradient(make(env, reduction="sum"), td)
     parts = []
-    for k, steps in enumerate((STEPS, 4)):
+    for k, steps in enumerate((STEPS, 2)):
         one = planned(alone[k], 0).set(PLAN, td[PLAN][k : k + 1, :steps])
         parts.append(value_and_gradient(make(alone[k], reduction="sum"), one))
     assert_same(both, added(*parts))

@@ -141,10 +141,10 @@ def test_with_rate_0_nobody_enters_and_within_the_log_nothing_changes(tmp_path):
 
 
 def test_what_comes_later_changes_nothing_before(tmp_path):
-    segments = [crossing(6, steps=26), hide(straight_road(6, steps=26), 4, slice(0, 5))]
+    segments = [crossing(6, steps=11), hide(straight_road(6, steps=11), 4, slice(0, 5))]
     store, found = fill(tmp_path / "store", segments), []
-    for seconds in (5, 6, 10):
-        config = SimulateConfig(interactive="all", duration=seconds, rollouts=2, search="none", inflow=1.0)
+    for seconds in (2, 3, 5):
+        config = SimulateConfig(interactive="all", duration=seconds, rollouts=1, search="none", inflow=1.0)
         found.append(simulation(small(), crowd_dataset(store, small(), config).scenes([0, 1]), config))
     for short, long in pairwise(found):
         steps, agents = short.rollouts.state.shape[-3:-1]
@@ -157,12 +157,12 @@ def test_what_comes_later_changes_nothing_before(tmp_path):
 @settings(max_examples=2, deadline=None)
 @given(st.integers(0, 100), st.sampled_from([0.3, 1.0]))
 def test_nobody_is_placed_into_another(seed, inflow):
-    segment = extended(straight_road(6, seed=seed), 101, inflow=inflow, seed=seed)
+    segment = extended(straight_road(6, seed=seed, steps=26), 76, inflow=inflow, seed=seed)
     scenes = scene(segment, list(range(segment.num_agents)), edge=map_edge(LaneGraph(segment.road)))
     found = simulation(DRIVER, scenes, SimulateConfig(rollouts=1)).rollouts
     there, state = found.counted[0, 0].numpy(), found.state[0, 0, 1:].numpy()
     came = [(int(there[:, n].argmax()), n) for n in np.flatnonzero(there.any(0) & ~there[0])]
-    assert [step >= 50 for step, _ in came] == [True] * max(len(came), 3)
+    assert [step >= 25 for step, _ in came] == [True] * max(len(came), 3)
     size = scenes.box_size[0].numpy() + 0.9
     for step, n in came:
         others = np.flatnonzero(there[step] & (np.arange(len(size)) != n))
@@ -226,16 +226,16 @@ def test_wrong_settings_are_refused():
 
 
 def test_rollouts_past_the_log_are_kept_and_judged_apart(tmp_path, capsys):
-    store = fill(tmp_path / "store", [straight_road(6), crossing(4)])
-    config = SimulateConfig(interactive="all", duration=20, rollouts=2, inflow=0.3)
+    store = fill(tmp_path / "store", [crossing(6, steps=21), pile_up()])
+    config = SimulateConfig(interactive="all", duration=9, rollouts=2, inflow=0.5)
     dataset, sim = crowd_dataset(store, DRIVER, config), tmp_path / "sim"
     command = ["simulate", DRIVER.name, "--data", str(store.path), "--out", str(sim), "--interactive", "all"]
-    assert cli.main([*command, "--duration", "20", "--rollouts", "2", "--inflow", "0.3"]) == 0
+    assert cli.main([*command, "--duration", "9", "--rollouts", "2", "--inflow", "0.5"]) == 0
     for i, one in enumerate(load_rollouts(sim)):
         assert content_hash(one.segment) == content_hash(dataset.segment(i))
-        assert (one.steps, one.segment.logged) == (100, 51)
+        assert (one.steps, one.segment.logged) == (45, 21)
         assert any(world_of(one, 0).valid[6:].any(1))
-        assert not one.logged(one.agents)[:, 51:].any()
+        assert not one.logged(one.agents)[:, 21:].any()
     # In batches of one the bytes are the same: everyone meets the same demand.
     again = save_simulation(tmp_path / "again", DRIVER, dataset, replace(config, batch=1))
     assert [entry.sha256 for entry in again.entries] == [entry.sha256 for entry in load_rollouts(sim).entries]
@@ -245,18 +245,18 @@ def test_rollouts_past_the_log_are_kept_and_judged_apart(tmp_path, capsys):
     assert sum(part["collisions"] for part in parts.values()) == sum(row["collisions"] for row in rows) > 0
     assert parts["past_log"]["agent_minutes"] > parts["log"]["agent_minutes"] > 0
     # What is compared with the log ends with it.
-    assert all(row["logged_steps"] <= 6 * 50 for row in rows)
+    assert all(row["logged_steps"] <= 6 * 20 for row in rows)
     assert cli.main(["report", str(sim)]) == 0
     assert "past log" in capsys.readouterr().out
     assert json.loads((sim / "report.json").read_text())["parts"] == parts
     assert "past its end" in (sim / "report.html").read_text()
     nobody = crowd_dataset(store, load_agent("playback"), config)  # who would drive those that enter
     assert nobody.segment(0).num_agents == 6
-    short = replace(config, duration=10)
+    short = replace(config, duration=4)
     within = save_simulation(tmp_path / "short", DRIVER, crowd_dataset(store, DRIVER, short), short)
     assert report(within).past_log() == {}
     with pytest.raises(ConfigError, match="past a log can't be compared"):
         evaluate(DRIVER, dataset, config)
-    for closed in (EvaluateConfig(duration=20, interactive="all"), SimulateConfig(duration=20)):
-        with pytest.raises(DataError, match="10 s, 20 are asked for"):
+    for closed in (EvaluateConfig(duration=9, interactive="all"), SimulateConfig(duration=9)):
+        with pytest.raises(DataError, match="4 s, 9 are asked for"):
             crowd_dataset(store, DRIVER, closed).scenes([0])

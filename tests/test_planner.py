@@ -77,7 +77,7 @@ class Locked(Wanderer):
 
 def dataset(count: int = 2) -> SceneDataset:
     store = SegmentStore(builtin_store("test"))
-    return SceneDataset(store, 2, small().dynamics, range(count), routes=True, duration=2)
+    return SceneDataset(store, 2, small().dynamics, range(count), routes=True, duration=1.2)
 
 
 def simulated(make: Any, count: int = 2, **settings: Any) -> Any:

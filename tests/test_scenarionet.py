@@ -17,6 +17,7 @@ from hypothesis.extra import numpy as arrays
 
 from fuzz_mutations import bytes_
 from helpers_scenarionet import FAR, STEPS, line, ring, scenario, track, write
+from helpers_segments import CHARACTERS
 from helpers_sources import off_road, read_error, read_one
 from symphony.data.convert import convert
 from symphony.data.segment import AgentType, LaneType, MarkType, SignalState
@@ -206,14 +207,16 @@ def test_names_that_can_not_be_written_end_no_conversion(key: str, tmp_path: Pat
     assert "\\ud800" in skipped["segment"] + skipped["field"]
 
 
-PROTOCOLS = range(4, pickle.HIGHEST_PROTOCOL + 1)
-SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=9)
+TEXT, PROTOCOLS = st.text(CHARACTERS, max_size=9), range(4, pickle.HIGHEST_PROTOCOL + 1)
+SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | TEXT
 ARRAYS = arrays.arrays(
-    st.sampled_from([np.dtype(name) for name in ("<f8", ">f4", "<i8", "|u1", "|b1", "<U3", "|S4")]),
+    st.sampled_from([np.dtype(name) for name in ("<f8", ">f4", "<i8", "|u1", "|b1", "|S4")]),
     arrays.array_shapes(max_dims=3, max_side=4, min_side=0),
 )
-TREES = st.recursive(SCALARS | ARRAYS | st.binary(max_size=5) | st.sets(st.integers(), max_size=3), lambda inner: (
-    st.lists(inner, max_size=4) | st.tuples(inner, inner) | st.dictionaries(st.text(max_size=4), inner, max_size=4)
+NAMES = st.lists(TEXT, max_size=3).map(lambda names: np.array(names, "<U3"))
+LEAVES = SCALARS | ARRAYS | NAMES | st.binary(max_size=5) | st.sets(st.integers(), max_size=3)
+TREES = st.recursive(LEAVES, lambda inner: (
+    st.lists(inner, max_size=4) | st.tuples(inner, inner) | st.dictionaries(TEXT, inner, max_size=4)
 ), max_leaves=12)  # fmt: skip
 
 

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers_segments import crossing, straight_road
+from helpers_segments import CHARACTERS, crossing, straight_road
 from helpers_store import fill
 from helpers_table import full_table, make_entry, make_record, make_run, row_of
 from symphony.cli import main
@@ -262,7 +262,7 @@ def test_names_differ_with_everything_that_changes_results() -> None:
 
 
 @settings(max_examples=20)
-@given(st.text(max_size=80), st.integers(0, 9))
+@given(st.text(CHARACTERS + "/", max_size=80), st.integers(0, 9))
 def test_names_are_file_names_and_differ_however_long_they_are(store: str, paths: int) -> None:
     """An evaluation of hours was lost where its name was too long for a file."""
     metric = [f"measures.of.comfort.{part}:{part}_of_all_agents" for part in range(paths)]

@@ -105,11 +105,11 @@ def test_nothing_of_the_future_is_used(settings):
 def test_vehicles_are_driven_and_people_walk_on(settings, monkeypatch):
     # Trees are independent, however many are searched at a time.
     monkeypatch.setattr("symphony.wosac.simulate.AT_ONCE", 12 * 2 * 3)
-    segment, settings = mixed_segment(), replace(settings, horizon=2.0)
+    segment, settings = mixed_segment(), replace(settings, horizon=1.0)
     found = wosac_rollouts(small(), segment, settings)
     assert found.object_id.tolist() == [100, 102, 103, 104]
-    assert all(getattr(found, name).shape == (32, 4, 20) for name in STATES)
-    start, steady = segment.origin[0] + segment.position[0, 10, 0], constant_velocity(segment, 20).x[:, 0]
+    assert all(getattr(found, name).shape == (32, 4, 10) for name in STATES)
+    start, steady = segment.origin[0] + segment.position[0, 10, 0], constant_velocity(segment, 10).x[:, 0]
     assert (np.abs((found.x[:, 0] - start) / (steady - start) - 1) < 0.5).all()
     # Every rollout is one of its own.
     assert len(np.unique(found.x[:, :, -1], axis=0)) == 32

@@ -25,14 +25,14 @@ from symphony.saved.rollouts import SavedRollouts, world_of
 KINDS = {name: kind for kind, name in KIND_NAMES.items()}
 BY_TYPE = {int(AgentType.PEDESTRIAN): CollisionKind.PEDESTRIAN, int(AgentType.CYCLIST): CollisionKind.CYCLIST}
 """What the evaluator calls a collision with them, whichever way they went."""
-PHASES = {0.2: (0.0, 0.25, 0.625), 0.1: (0.375, 0.875)}
-"""For each length of a step in seconds where in it the scene begins: other seconds for each."""
+PHASES = {0.2: ((0.0, 0.25), (0.0, 0.625)), 0.1: ((0.375,), (0.875,))}
+"""For each length of a step in seconds where in it every other scene begins: other seconds for each."""
 ALL = [*cases(), *bridges()]
 
 
-def rollouts(case: Case, dt: float) -> list[SavedRollouts]:
+def rollouts(case: Case, dt: float, phases: tuple[float, ...]) -> list[SavedRollouts]:
     """One of the case for each phase, with the flags that the simulation would have set."""
-    made = [segment_of(case, dt, phase) for phase in PHASES[dt]]
+    made = [segment_of(case, dt, phase) for phase in phases]
     found = [played(segment) for segment, _ in made]
     scenes = collate([scene(segment, [0]) for segment, _ in made])
     state = torch.from_numpy(np.stack([state for _, state in made]).astype(np.float32))[:, None, :, None]
@@ -103,7 +103,8 @@ def check(case: Case, row: dict[str, Any], events: list[Any], saved: SavedRollou
 @pytest.mark.parametrize("dt", PHASES)
 @pytest.mark.parametrize("case", ALL, ids=[case.name for case in ALL])
 def test_a_report_says_what_is_right(case: Case, dt: float) -> None:
-    for phase, saved in zip(PHASES[dt], rollouts(case, dt), strict=True):
+    phases = PHASES[dt][ALL.index(case) % 2]
+    for phase, saved in zip(phases, rollouts(case, dt, phases), strict=True):
         found = Report("made", "ego")
         add_segment(found, saved)
         check(case, found.rows[0], found.events[case.name], saved, phase * dt)
