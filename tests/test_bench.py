@@ -61,12 +61,17 @@ def broken(seen):
 """
 
 
+@pytest.fixture(scope="module")
+def roads(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = [straight_road(2, steps=8, seed=k, segment_id=f"road-{k}") for k in range(6)]
+    return fill(tmp_path_factory.mktemp("data") / "store", found).path
+
+
 @pytest.fixture
-def suite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def suite(roads: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A suite of six segments, each a group of its own, in two parts."""
     monkeypatch.setattr(bench, "ROUNDS", 2)
-    roads = [straight_road(2, steps=8, seed=k, segment_id=f"road-{k}") for k in range(6)]
-    fill(tmp_path / "store", roads)
+    (tmp_path / "store").symlink_to(roads)
     (tmp_path / "planners.py").write_text(PLANNERS)
     (tmp_path / "suite.toml").write_text(SUITE)
     return tmp_path / "suite.toml"
@@ -235,7 +240,7 @@ def test_a_suite_that_was_interrupted_goes_on_and_regressions_are_named(suite: P
 @pytest.mark.parametrize(("name", "status"), [("suite.toml", 0), ("suite_fails.toml", 1)])
 def test_examples_end_as_they_say(tmp_path: Path, name: str, status: int, monkeypatch: Any) -> None:
     monkeypatch.setattr(bench, "ROUNDS", 1)
-    brief(tmp_path / "brief", range(5))
+    brief(tmp_path / "brief", range(5), 16)
     text = (EXAMPLES / name).read_text().replace("rollouts = 2", "rollouts = 1")
     text = text.replace('data = "builtin:test"', 'data = "brief"')
     text = text.replace("at_least = 50", "at_least = 10")  # so few runs tell little

@@ -149,8 +149,8 @@ def test_what_follows_an_end_changes_nothing(rule, agents, time):
             over = (x - 0.5 * v).abs() > 1.5  # so was the state before
             return torch.where(over, garbage, -td.get((*group, "reward")).squeeze(-1))
 
-        env, noise = Mass(agents=agents, sticky=sticky), torch.full((20, 4), 0.3)
-        how |= {"steps": 12, "prune_every": 3, "rule": rule, "noise": noise, "aggregate": whole}
+        env, noise = Mass(agents=agents, sticky=sticky), torch.full((20, 3), 0.3)
+        how |= {"steps": 9, "prune_every": 3, "rule": rule, "noise": noise, "aggregate": whole}
         return collectors.beam_search(env, policy, score, start, **how)
 
     whole = collectors.Aggregate(time)

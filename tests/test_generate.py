@@ -258,7 +258,7 @@ RULE = sumo.CropRule(focuses=2, per_focus=3)
 def simulated() -> dict[str, list[RunSegment]]:
     """Short runs of every kind; seeds with lights, roundabouts and stop signs among them."""
     runs = (("town", 3), ("grid", 1), ("ramp", 1))
-    return {f"{kind}-{seed}": sumo.generate_run(kind, seed, 45.0, rule=RULE)[0] for kind, seed in runs}
+    return {f"{kind}-{seed}": sumo.generate_run(kind, seed, 35.0, rule=RULE)[0] for kind, seed in runs}
 
 
 @pytest.fixture(scope="module", params=["simulated", *BUILT_IN])

@@ -56,7 +56,7 @@ def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     first = train(tiny("mgail_h", store, folder / "mgail_h-0", steps=2, mgail=mgail))
     shown = ValidationConfig(data=store, segments=1, rollouts=1)
     after = folder / "mgail_ts_h-0"
-    out = train(tiny("mgail_ts_h", store, after, warm_start=first, validation=shown, mgail=mgail))
+    out = train(tiny("mgail_ts_h", store, after, steps=2, warm_start=first, validation=shown, mgail=mgail))
     assert main(f"evaluate {out} --data {store} --rollouts 2 --rule best --prune-every 3".split()) == 0
     return out
 

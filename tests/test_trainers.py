@@ -245,11 +245,17 @@ def run_script(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Pat
     return run
 
 
-@pytest.mark.parametrize("method", RECIPES)
-def test_recipe(run_script: Any, tmp_path: Path, method: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.fixture(scope="module")
+def splits(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("data")
     for split, seed in (("train", 0), ("test", 1)):
-        fill(tmp_path / split, [straight_road(4, seed=seed, steps=5), crossing(4, seed=seed, steps=5)])
-    words = f"--data train --test test --out run {ARGUMENTS[method]}"
+        fill(path / split, [straight_road(4, seed=seed, steps=5), crossing(4, seed=seed, steps=5)])
+    return path
+
+
+@pytest.mark.parametrize("method", RECIPES)
+def test_recipe(run_script: Any, splits: Path, tmp_path: Path, method: str, capsys: Any) -> None:
+    words = f"--data {splits}/train --test {splits}/test --out run {ARGUMENTS[method]}"
     assert run_script(SCRIPTS / f"{method}.py", words) == 0
     (file,) = (tmp_path / "run" / "evaluations").iterdir()
     found = json.loads(file.read_text())

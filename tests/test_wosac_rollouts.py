@@ -416,8 +416,8 @@ def test_a_segment_that_cannot_be_scored_ends_no_others_whatever_the_workers(tmp
 
 def test_the_record_has_the_score_and_tables_have_its_columns(tmp_path, capsys, monkeypatch):
     usual = WosacSettings.of
-    monkeypatch.setattr(WosacSettings, "of", lambda config: replace(usual(config), horizon=2.0))
-    fill(tmp_path / "store", [straight_road(2, seed=k, group=f"recording {k}") for k in range(2)])
+    monkeypatch.setattr(WosacSettings, "of", lambda config: replace(usual(config), horizon=1.0))
+    fill(tmp_path / "store", [straight_road(2, 16, seed=k, group=f"recording {k}") for k in range(2)])
     one, data = tmp_path / "one.json", str(tmp_path / "store")
     how = ("--json", str(one), "--rollouts", "2", "--metrics", "wosac")
     assert main(["evaluate", RANDOM, "--data", data, *how]) == 0
