@@ -24,9 +24,10 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore:.*VecNorm
 ENVIRONMENTS: dict[str, Callable[[], envs.EnvBase]] = {
     "rows": lambda: with_rows(Mass(), [ROWS]), "sticky": lambda: with_rows(Mass(sticky=True), [ROWS]),
     "own batch": lambda: Mass((ROWS,)), "agents": lambda: with_rows(Mass(agents=2), [ROWS]), "one": Mass,
-    "endless": lambda: with_rows(Mass(limit=99.0), [ROWS]),
+    "endless": lambda: with_rows(Mass(limit=99.0), [ROWS]), "sticky, own batch": lambda: Mass((ROWS,), sticky=True),
+    "sticky agents": lambda: with_rows(Mass(agents=2, sticky=True), [ROWS]),
+    "agents, own batch": lambda: Mass((ROWS,), agents=2),
 }  # fmt: skip
-OBSERVED = {"agents": ("agents", "observation")}
 TRANSFORMS: dict[str, Callable[[Any], list[envs.Transform]]] = {
     "none": lambda key: [],
     "counters": lambda key: [envs.StepCounter(6), envs.RewardSum()],
@@ -82,18 +83,18 @@ def assert_same_until_done(env: Callable[[], envs.EnvBase], policy: Any, **kwarg
     (e, t, inside)
     for e, t, inside in itertools.product(ENVIRONMENTS, TRANSFORMS, (False, True))
     # TorchRL's CatFrames takes no reset of each agent apart.
-    if t.startswith("statistics") == (e == "endless") and (e, t) != ("agents", "frames")
-    if not inside or e not in ("one", "own batch")
+    if t.startswith("statistics") == (e == "endless") and not ("agents" in e and t == "frames")
+    if not inside or (e != "one" and "own" not in e)
 ])  # fmt: skip
 def test_one_branch_is_torchrls_collector(env, transforms, inside):
     # Statistics are of all rows, also of those that are reset: here no row is.
-    key = OBSERVED.get(env, "observation")
+    key = ("agents", "observation") if "agents" in env else "observation"
 
     def make() -> envs.EnvBase:
         torch.manual_seed(0)
         if inside:  # the transforms are, the rows come last
             limit = 99.0 if env == "endless" else 1.5
-            base = Mass(agents=2 if env == "agents" else None, sticky=env == "sticky", limit=limit)
+            base = Mass(agents=2 if "agents" in env else None, sticky="sticky" in env, limit=limit)
             return with_rows(envs.TransformedEnv(base, envs.Compose(*TRANSFORMS[transforms](key))), [ROWS])
         return envs.TransformedEnv(ENVIRONMENTS[env](), envs.Compose(*TRANSFORMS[transforms](key)))
 
@@ -104,7 +105,7 @@ def test_one_branch_is_torchrls_collector(env, transforms, inside):
 
 
 @pytest.mark.parametrize(
-    ("env", "inside"), [("rows", False), ("rows", True), ("sticky", False), ("own batch", False)]
+    ("env", "inside"), [(e, False) for e in ("rows", "sticky", "own batch", "sticky, own batch")] + [("rows", True)]
 )
 @pytest.mark.parametrize("transforms", ["none", "counters", "frames"])
 def test_one_branch_with_memory_is_torchrls_collector(env, inside, transforms):
