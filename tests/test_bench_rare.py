@@ -97,10 +97,11 @@ def test_near_is_whoever_is_ahead_and_a_hit_is_remembered() -> None:
     scenes = scene(segment, [0, 1, 2], LaneGraph(segment.road))
     env = DrivingEnv(scenes)
 
-    def near(gap: float, speed: float, behind: float = 6.0, hit: float = 0.0) -> float:
+    def near(gap: float, speed: float, behind: float = 6.0, hit: float = 0.0, aside: float = 0.0) -> float:
         start = env.start(torch.zeros(1, dtype=torch.int64))
         x = torch.tensor([0.0, float(scenes.box_size[0, :2, 0].mean()) + gap, -behind])
-        state = torch.stack([x, 0 * x, 0 * x, torch.tensor([speed, 0.0, 0.0])], -1)
+        y, zero = torch.tensor([0.0, 0.0, aside]), torch.zeros(3)
+        state = torch.stack([x, y, zero, torch.tensor([speed, 0.0, 0.0])], -1)
         lure = Nearness(env, start)
         start.set(keys.STATE, state[None])
         start.set("hit", torch.full((1, 1), hit))
@@ -109,6 +110,9 @@ def test_near_is_whoever_is_ahead_and_a_hit_is_remembered() -> None:
     assert near(1.0, 20.0) > near(4.0, 20.0) > near(4.0, 0.0) > 0
     assert near(300.0, 0.0) == 0
     assert near(300.0, 0.0, behind=0.5) == 0
+    # Who merges from beside counts, with its centre behind the ego's or not.
+    assert near(300.0, 0.0, behind=2.0, aside=2.5) > near(300.0, 0.0, behind=2.0, aside=4.0) > 0
+    assert near(300.0, 0.0, behind=9.0, aside=2.5) == 0
     assert near(-1.0, 5.0) == 1
     assert near(300.0, 0.0, hit=1.0) == 1
 

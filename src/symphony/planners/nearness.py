@@ -53,12 +53,15 @@ class Nearness(TensorDictModuleBase):
         own = now.state.gather(1, ego[..., None].expand(-1, 1, 5))
         size = now.size.gather(1, ego[..., None].expand(-1, 1, 2))
         way, speed = now.state[..., :2] - own[..., :2], now.state[..., 3:] - own[..., 3:]
-        ahead = way[..., 0] * own[..., 2].cos() + way[..., 1] * own[..., 2].sin() > 0
+        cos, sin = own[..., 2].cos(), own[..., 2].sin()
+        along, aside = way[..., 0] * cos + way[..., 1] * sin, way[..., 1] * cos - way[..., 0] * sin
+        reach = 0.5 * (now.size.norm(dim=-1) + size.norm(dim=-1))
+        # Who drives into whom is open where two merge, so those beside the ego count; a follower does not.
+        ahead = (along > 0) | ((along > -reach) & (aside.abs() > 0.5 * size[..., 1]))
         there = ahead & now.valid & (torch.arange(way.shape[1], device=ego.device) != ego)
         if now.height is not None:
             mine = now.height.gather(1, ego[..., None].expand(-1, 1, now.height.shape[-1]))
             there &= ~levels_apart(now.height, mine)
-        reach = 0.5 * (now.size.norm(dim=-1) + size.norm(dim=-1))
         there &= way.norm(dim=-1) - reach < FAR + AHEAD * speed.norm(dim=-1)
         m, a = there.nonzero(as_tuple=True)
         later = torch.linspace(0.0, AHEAD, 7, device=ego.device)
