@@ -18,12 +18,7 @@ CHARACTERS = "aZ09 .,:;-_|\\\"'<>&$*\n\t\0\x1b\u2028\ufeff\xe9\u6f22\U0001f600" 
 
 
 def make_road(
-    lanes: list[Any],
-    successors: Any = (),
-    left: Any = (),
-    right: Any = (),
-    boundary: Any = (),
-    marks: Any = (),
+    lanes: list[Any], successors: Any = (), left: Any = (), right: Any = (), boundary: Any = (), marks: Any = ()
 ) -> RoadMap:
     """A map of surface streets with lane ids 100, 101, ...; marks are road lines."""
 
@@ -41,13 +36,7 @@ def make_road(
 
 
 def make_segment(
-    road: RoadMap,
-    position: Any,
-    heading: Any,
-    velocity: Any,
-    dt: float = 0.2,
-    segment_id="made",
-    **changes: Any,
+    road: RoadMap, position: Any, heading: Any, velocity: Any, dt: float = 0.2, segment_id="made", **changes: Any
 ) -> RunSegment:
     """Cars that are valid throughout, the first being the ego; any other field by name."""
     agents, steps = heading.shape

@@ -22,13 +22,7 @@ from helpers_runs import tiny
 from helpers_segments import CHARACTERS, crossing
 from helpers_store import fill
 from symphony.agents import checkpoint as module
-from symphony.agents.checkpoint import (
-    MANIFEST,
-    CheckpointError,
-    checkpoints,
-    load_checkpoint,
-    save_checkpoint,
-)
+from symphony.agents.checkpoint import MANIFEST, CheckpointError, checkpoints, load_checkpoint, save_checkpoint
 from symphony.agents.choice import choose
 from symphony.config import ValidationConfig
 from symphony.errors import DataError, SymphonyError

@@ -421,7 +421,7 @@ def lanes_that_end(pieces):
     return make_road(flat, links[:-1], left=beside[1], right=beside[-1])
 
 
-@settings(max_examples=4)
+@settings(max_examples=2)
 @given(
     st.lists(st.tuples(st.sampled_from([-1, 1]), st.floats(-1.5, 1.5)), min_size=9, max_size=9),
     st.floats(0, 40), st.floats(0, 12),

@@ -207,7 +207,7 @@ def test_other_time_steps(scenes, dt, tmp_path):
     assert_metrics_finite(agent, tmp_path / "store")
 
 
-LENGTHS = (6, 4, 6)
+LENGTHS = (5, 3, 5)
 """Steps of the segments ``straight-0``, ``crossing-1`` and ``crossing-2``."""
 SEARCHES = (("none", "best"), ("tree", "systematic"), ("backtrack", "best"))
 
@@ -279,12 +279,12 @@ def test_segment_and_step_are_those_where_it_began(store, search, rule, value, b
     config = EvaluateConfig(rollouts=2, search=search, rule=rule, batch=batch)
     # Items of a batch of one are all its scene 0: the first segment is the bad one there.
     scene, segment = (0, "straight-0") if batch == 1 else (2, "crossing-2")
-    broken = replace(good, policy=Spoiled(good.policy, keys.LOGITS, scene, 4, value))
-    with pytest.raises(NotFiniteError, match=f"segment {segment}: the policy .* at step 4$"):
+    broken = replace(good, policy=Spoiled(good.policy, keys.LOGITS, scene, 3, value))
+    with pytest.raises(NotFiniteError, match=f"segment {segment}: the policy .* at step 3$"):
         evaluate(broken, store, config)
     if search != "none":
-        broken = replace(good, discriminator=Spoiled(good.discriminator, keys.SCORE, scene, 4, value))
-        with pytest.raises(NotFiniteError, match=f"segment {segment}: the discriminator .* at step 4$"):
+        broken = replace(good, discriminator=Spoiled(good.discriminator, keys.SCORE, scene, 3, value))
+        with pytest.raises(NotFiniteError, match=f"segment {segment}: the discriminator .* at step 3$"):
             evaluate(broken, store, config)
 
 

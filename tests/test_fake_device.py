@@ -120,9 +120,8 @@ def test_others_that_a_rule_drives_stay_on_the_device():
 
 
 def test_searches_stay_on_the_device():
-    with world() as (device, agent, env):
-        row = torch.arange(2, device=device.device)[:, None, None].expand(2, 1, 4)
-        start = env.start(row, row, env.scenes.route_logged[row])  # simulations draw goals
+    with world() as (_, agent, env):
+        start = start_states(env, agent.goals, trees=1, branches=4, seed=0)
         found = searched(agent, env, Systematic(0.6), start)
         assert found.trajectories.shape == (2, 1, 3, LOGGED - 1)
         assert found.totals.device.type == NAME

@@ -251,14 +251,14 @@ def test_measures_do_not_depend_on_which_way_north_is(altered: Any, segments: li
 
 
 BUILT_IN: tuple[Literal["train", "test"], ...] = ("train", "test")
-RULE = sumo.CropRule(focuses=2, per_focus=3)
+RULE = sumo.CropRule(focuses=3, per_focus=4)
 
 
 @pytest.fixture(scope="module")
 def simulated() -> dict[str, list[RunSegment]]:
     """Short runs of every kind; seeds with lights, roundabouts and stop signs among them."""
     runs = (("town", 3), ("grid", 1), ("ramp", 1))
-    return {f"{kind}-{seed}": sumo.generate_run(kind, seed, 35.0, rule=RULE)[0] for kind, seed in runs}
+    return {f"{kind}-{seed}": sumo.generate_run(kind, seed, 45.0, rule=RULE)[0] for kind, seed in runs}
 
 
 @pytest.fixture(scope="module", params=["simulated", *BUILT_IN])

@@ -105,11 +105,7 @@ def test_it_is_the_mean_cost_of_what_the_actor_drives_into(env, cost):
     counted = torch.ones(2, STEPS, 2, dtype=torch.bool)
     counted[1, 2:] = False
     of = costs[counted]
-    for reduction, value in (
-        ("mean", of.mean()),
-        ("sum", of.sum()),
-        ("none", torch.where(counted, costs, 0.0)),
-    ):
+    for reduction, value in (("mean", of.mean()), ("sum", of.sum()), ("none", torch.where(counted, costs, 0.0))):
         out = make(env, cost=cost, reduction=reduction)(td)
         torch.testing.assert_close(out["loss_mgail"], value)
         torch.testing.assert_close(out["mgail_score"], score[counted].mean().detach())

@@ -88,11 +88,7 @@ def simulated(make: Any, count: int = 2, **settings: Any) -> Any:
 
 
 TREE: dict[str, Any] = {"search": "tree", "branches": 6, "rule": "best", "prune_every": 5}
-SEARCHES = [
-    {"search": "none"},
-    TREE,
-    {"search": "tree", "branches": 6, "rule": "systematic", "trees": 2},
-]
+SEARCHES = [{"search": "none"}, TREE, {"search": "tree", "branches": 6, "rule": "systematic", "trees": 2}]
 
 
 class Foreseeing(Wanderer):

@@ -28,7 +28,7 @@ from symphony.envs.scene import scene
 from symphony.errors import ConfigError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
-from symphony.render import Clip
+from symphony.render import Clip, animate_rollouts
 from symphony.rollouts.driving import playback, simulate_batch
 from symphony.rollouts.unroll import Rollouts
 from symphony.training.hooks import QUANTILES, ROLLOUTS, quantiles, samples_of
@@ -42,6 +42,7 @@ def few() -> Iterator[None]:
     """Two run segments are shown."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("symphony.training.hooks.SEGMENTS", 2)
+        patch.setattr("symphony.training.hooks.animate_rollouts", partial(animate_rollouts, size=2.0))
         yield
 
 

@@ -342,13 +342,11 @@ def test_compiled_runs_are_the_runs_by_one_program_for_batches_of_few_shapes(sto
         programs.add(graph)
         return graph.forward
 
-    def noted(step, **_):
-        def run(*given):
-            entries = given[-1].flatten_keys().items()
-            programs.add(tuple((name, value.shape, value.stride()) for name, value in entries))
-            return step(*given)
+    def depends(state):
+        return tuple((name, value.shape, value.stride()) for name, value in state.flatten_keys().items())
 
-        return run
+    def noted(step, **_):
+        return lambda *given: programs.add(depends(given[-1])) or step(*given)
 
     monkeypatch.setitem(sys.modules["symphony.rollouts.search"].COMPILER, "backend", backend)
     if kind == "none":  # to compile takes seconds: what a program depends on tells as much
@@ -365,7 +363,7 @@ def test_compiled_runs_are_the_runs_by_one_program_for_batches_of_few_shapes(sto
 
 def test_the_batch_changes_nothing_in_lines(store, monkeypatch):
     module = sys.modules["symphony.rollouts.search"]
-    monkeypatch.setattr(module, "Backtrack", partial(Backtrack, cap=2.0))
+    monkeypatch.setattr(module, "Backtrack", partial(Backtrack, cap=1.0))
     config = replace(LINES, rollouts=3, interactive="all")
     whole = crowds(store, [1, 2, 3], config)
     assert whole.steps > 1.1 * 3 * 3 * (whole.rollouts.state.shape[2] - 1)
@@ -388,7 +386,7 @@ def test_lines_avoid_what_they_are_judged_by(store, monkeypatch):
 
 def test_who_begins_again_draws_goals_anew(store, monkeypatch):
     module = sys.modules["symphony.rollouts.search"]
-    monkeypatch.setattr(module, "Backtrack", lambda *given, **named: Backtrack(*given, **named, back=(1, 0), cap=2.0))
+    monkeypatch.setattr(module, "Backtrack", lambda *given, **named: Backtrack(*given, **named, back=(1, 0), cap=1.0))
     config = replace(LINES, score="flags", threshold=-1.0, rollouts=8)  # bad whatever happens
     none, lines, logged = (
         crowds(store, [0, 2], how)

@@ -160,10 +160,7 @@ def test_configurations_are_read_back_strictly(store: Path, tmp_path: Path) -> N
         from_dict(TrainConfig, {**saved, "learning_rat": 1})
     with pytest.raises(ConfigError, match="missing"):
         from_dict(TrainConfig, {"out": "x", "method": "bc"})
-    for wrong, message in (
-        ({"seed": 1 << 40}, "seed must be at most"),
-        ({"steps": 0}, "steps must be positive"),
-    ):
+    for wrong, message in (({"seed": 1 << 40}, "seed must be at most"), ({"steps": 0}, "steps must be positive")):
         with pytest.raises(ConfigError, match=message):
             replace(config(store, tmp_path), **wrong)
 
