@@ -73,7 +73,7 @@ class Test(shared.Command):
             files.write_file(index, page(result, view=self.view))
             if shared.write_numbers(self.json, result.plain()):
                 for one in result.verdicts:
-                    shared.say(f"{one.status:8}{one.planner} among {one.crowd}: {sentence(one)}")
+                    shared.say(f"{one.status:9} {one.planner} among {one.crowd}: {sentence(one)}")
                 for run in result.regressions[:5]:  # all of them are in the files
                     which = "segment {segment}, rollout {rollout}, seed {seed}: {what}".format_map(run)
                     shared.say(f"worse than the baseline: {run['planner']} among {run['crowd']}, {which}")
