@@ -11,7 +11,7 @@ from symphony.collectors import BeamSearchCollector, KeepAll, with_rows
 from symphony.envs import Displacement, DrivingEnv
 from symphony.learning import SceneDataset, SearchReplay
 from symphony.modules import SeededNoise
-from symphony.rollouts.search import branched_streams, collector_settings, realism_score
+from symphony.rollouts.search import branched_streams, collector_settings, compiled, realism_score
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 
@@ -40,7 +40,7 @@ def mgail(config: TrainConfig, processes: Processes) -> Trainer:
 
     # Losses and optimizers.
     regression_loss = processes.wrap_ddp(BCLoss(policy))
-    mgail_loss = processes.wrap_ddp(MGAILLoss(policy, discriminator, env, **config.mgail.gradient))
+    mgail_loss = processes.wrap_ddp(MGAILLoss(policy, discriminator, env, **config.mgail.gradient, **compiled(data)))
     realism_loss = processes.wrap_ddp(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)

@@ -12,7 +12,7 @@ from symphony.config.training import GOALS
 from symphony.envs import Displacement, DrivingEnv
 from symphony.learning import SceneDataset, SearchReplay
 from symphony.modules import SeededNoise
-from symphony.rollouts.search import collector_settings, pruning_rule, realism_score, with_drawn_goals
+from symphony.rollouts.search import collector_settings, compiled, pruning_rule, realism_score, with_drawn_goals
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 
@@ -41,7 +41,7 @@ def mgail_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
 
     # Losses and optimizers.
     regression_loss, goal_loss = processes.wrap_ddp(BCLoss(policy)), processes.wrap_ddp(GoalLoss(goals))
-    mgail_loss = processes.wrap_ddp(MGAILLoss(policy, discriminator, env, **config.mgail.gradient))
+    mgail_loss = processes.wrap_ddp(MGAILLoss(policy, discriminator, env, **config.mgail.gradient, **compiled(data)))
     realism_loss = processes.wrap_ddp(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
     rates = config.rates(optimizers)

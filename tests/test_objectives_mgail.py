@@ -274,6 +274,22 @@ def test_bad_calls_are_refused(env):
             make(env, **bad)
 
 
+@pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
+def test_compiled_steps_give_the_same_loss_and_gradient(env):
+    torch.compiler.reset()
+    programs = []
+
+    def backend(graph, _):
+        programs.append(graph)
+        return graph.forward
+
+    td, how = planned(env), {"detach_keys": SEEN, "truncate": 2}
+    plain, compiled = value_and_gradient(make(env, **how), td), make(env, **how, compile_step={"backend": backend})
+    for _ in range(2):
+        assert_same(value_and_gradient(compiled, td), plain)
+    assert len(programs) == 2  # of states with and without a gradient
+
+
 @pytest.mark.parametrize("agents", [None, 2])
 def test_an_episode_ends_once(agents):
     """An environment that comes back into its bounds is scored like one that stays out, unless told otherwise."""

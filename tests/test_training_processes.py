@@ -185,7 +185,7 @@ def test_who_comes_second_does_not_go_on_from_what_it_saw_at_first(run, store, t
     first, second = (build(tiny("bc", store, part, resume=resume)) for _ in range(2))
     first.run()
     done = learned(part)
-    with pytest.raises(ConfigError, match=r"part.*(holds a run already|another process went on)"):
+    with pytest.raises(ConfigError, match=r"part.*(holds a run already|another process has continued)"):
         second.run()
     assert learned(part) == done == learned(run)
 

@@ -29,12 +29,11 @@ from symphony.collectors.branching import (
     take_values,
 )
 from symphony.collectors.rules import Aggregate, KeepBest, Pruning, PruningRule, max_then_sum, sample_size
+from symphony.programs import compiled, ordered
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Score = Callable[[TensorDictBase], Tensor]
 Aggregation = Callable[[Tensor], Tensor]
-PROGRAMS = 64
-"""The most programs that compiled searches of a process may have: one for all states of a shape."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +167,7 @@ def beam_search(
         raise ValueError(f"leaves must be 1 ... {branches} branches, is {leaves}")
     check_branching(env, start)
     whole = branched_env(env, start.shape)
-    one_step = _compiled(whole, compile_step) if compile_step else _step
+    one_step = compiled(_step, whole, compile_step) if compile_step else _step
     # What a policy only writes is made again at each step; all else, such as its memory, is carried on.
     written = [key for key in getattr(policy, "out_keys", ()) if key not in getattr(policy, "in_keys", ())]
     how = start.shape, policy, score, aggregate, keep, until_done, one_step, start, written, value
@@ -280,7 +279,7 @@ class Simulation:
         # Policy and environment write into the TensorDict they are given.
         now, records, scores, ends, states = now.copy(), [], [], [ended], []
         for _ in range(length):
-            now = now if self.step is _step else _ordered(now.exclude(*self.written), self.start)
+            now = now if self.step is _step else ordered(now.exclude(*self.written), self.start)
             kept, now, worth, end = self.step(env, self.policy, self.score, self.keep, now)
             records.append(kept)
             scores.append(worth)
@@ -335,35 +334,6 @@ def _step(
     values = values if values.is_floating_point() else values.float()
     kept = stepped if keep is None else stepped.select(*keep)
     return kept, now, values, _ended(env, stepped.get("next"), now.ndim)
-
-
-def _compiled(env: EnvBase, how: bool | Mapping[str, Any]) -> Callable[..., Any]:
-    _ = env._step_mdp, env.done_keys, env.reward_keys  # kept once read, on which a program depends
-    settings: dict[str, Any] = {"fullgraph": True, "recompile_limit": PROGRAMS}
-    program = torch.compile(_step, **settings, **(how if isinstance(how, Mapping) else {}))
-
-    def run(*given: Any) -> Any:
-        try:
-            return program(*given)
-        except Exception as error:
-            if not type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
-                raise
-            raise ValueError(f"a step can't be compiled: {str(error).strip().splitlines()[0]}") from error
-
-    return run
-
-
-def _ordered(state: TensorDictBase, like: TensorDictBase) -> TensorDictBase:
-    """Return the entries in the order of the first state and without views: anything else would be compiled again."""
-    entries = {}
-    for key in sorted(state.keys(), key=[*like.keys(), *state.keys()].index):
-        value = state.get(key)
-        if isinstance(value, TensorDictBase):
-            value = _ordered(value, like.get(key, value))
-        elif value._is_view():
-            value = value.clone(memory_format=torch.contiguous_format)
-        entries[key] = value
-    return TensorDict(entries, state.batch_size, device=state.device)
 
 
 def _ended(env: EnvBase, state: TensorDictBase, batch: int, how: str = "done") -> Bool[Tensor, "*b S K"]:

@@ -117,7 +117,7 @@ class RunConfig(Settings):
     #: and WANDB_TAGS name project, group and tags.
     wandb: Literal["offline", "online", "disabled"] = "offline"
     device: str = "cpu"  # Device to train on: `cpu`, `cuda` or `cuda:N`.
-    #: Compile the steps of searches, which takes minutes: `auto`, on a device where a run is long enough to win.
+    #: Compile the steps of searches and of MGAIL, which takes minutes: `auto`, on a device if a run is long enough.
     compile: Compile = "auto"
 
 

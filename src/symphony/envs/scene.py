@@ -284,7 +284,9 @@ def collate(scenes: Sequence[SceneBatch], agents: int = 0, shapes: dict[str, lis
         raise DataError(f"segments of different time steps in one batch: {lengths}", field="dt")
     parts, fields = [dict(item.items()) for item in scenes], {}
     if any(part["point_height"].shape[1] for part in parts) or (shapes or {}).get("point_height", [0])[0]:
-        parts = [part if part["point_height"].shape[1] else part | _no_heights(part) for part in parts]
+        like = {"agent": "log_valid", "point": "point_valid", "edge": "edge_valid"}.items()
+        for part in (part for part in parts if not part["point_height"].shape[1]):
+            part |= {f"{name}_height": torch.zeros(*part[of].shape, 2) for name, of in like}
     for name in SceneBatch.__annotations__:
         values = [part[name] for part in parts]
         each = {value.shape[1:] for value in values}
@@ -345,12 +347,6 @@ def _edges(boundary: Polylines, levels: Levels) -> dict[str, NDArray[Any]]:
         "edge_valid": np.ones(len(start), bool),
         "edge_height": np.zeros((0, 2), np.float32) if levels.flat else levels.at(middle),
     }
-
-
-def _no_heights(part: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return empty heights for a scene without levels, to stand beside others that have some."""
-    sizes = {"agent": "log_valid", "point": "point_valid", "edge": "edge_valid"}
-    return {f"{name}_height": torch.zeros(*part[like].shape, 2) for name, like in sizes.items()}
 
 
 def _points(segment: RunSegment, levels: Levels) -> dict[str, NDArray[Any]]:

@@ -12,7 +12,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Shaped
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -141,7 +141,9 @@ class SceneDataset:
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
         self.routes, self.duration, self.keep, self.few_shapes = routes, duration, keep, few_shapes
-        self.scene = ItemCache(self._prepared, _nbytes, keep=keep, name="prepared run segments")
+        size = lambda one: sum(getattr(one, name).nbytes for name in SceneBatch.__annotations__)  # noqa: E731
+        prepare = lambda items: [self._scene(i) for i in items]  # noqa: E731
+        self.scene = ItemCache(prepare, size, keep=keep, name="prepared run segments")
         self.experts = ItemCache(self.fit, attrgetter("nbytes"), keep=keep, name="demonstrations")
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
@@ -150,6 +152,7 @@ class SceneDataset:
         self._batch = lru_cache(1)(
             lambda items: collate(self.scene.many(items), shapes=shapes if self.few_shapes else None)
         )
+        self._placed = lru_cache(1)(lambda items, device: self.scenes(items).to(device))
 
     @property
     def _how(self) -> dict[str, Any]:
@@ -214,9 +217,6 @@ class SceneDataset:
         graph, segment = self.graph(i) if self.routes else None, self.segment(i)
         return scene(segment, self.interactive, graph, number=i)
 
-    def _prepared(self, items: Sequence[int]) -> list[SceneBatch]:
-        return [self._scene(i) for i in items]
-
     def scenes(self, items: Sequence[int]) -> SceneBatch:
         """Return several items as one padded batch."""
         found: SceneBatch = self._batch(tuple(items))
@@ -279,11 +279,14 @@ class SceneDataset:
         seen = None
         if observation.route:
             progress = torch.cat([e.progress.flatten() for e in found])[begin[row] + when]
-            seen = _seen_routes(found, row, progress, state)
+            # An agent that is displaced along the route by some metres has come as far as where it is now.
+            near = torch.full_like(progress, DISPLACED)[:, None]
+            taken = logged_routes([one for e in found for one in e.routes], row)
+            seen = taken.window(taken.progress(state[:, None, :2], progress[:, None], near))
         where = item.to(device), when.to(device), agent.to(device), state.to(device)
         routes = None if seen is None else RouteWindow(*(part.to(device) for part in seen))
         action = action.to(device)
-        return expert_batch(scenes.to(device), *where, observation, action=action, routes=routes)
+        return expert_batch(self._placed(tuple(items), device), *where, observation, action=action, routes=routes)
 
     def sample_goals(
         self,
@@ -300,19 +303,20 @@ class SceneDataset:
             (-1 for vehicles on no lane) and ``GOAL_SET``, all that are equally right.
         """
         each = self.experts.many(items)
-        found = [(i, expert, k) for i, expert in enumerate(each) for k in range(len(expert.agent))]
+        first_steps = [expert.valid.int().argmax(1).tolist() for expert in each]
+        found = [(i, k, t) for i, begins in enumerate(first_steps) for k, t in enumerate(begins)]
         pick = torch.randint(len(found), (count,), generator=rng).tolist()
         chosen = [found[k] for k in pick]
-        when = torch.stack([e.valid[k].int().argmax() for _, e, k in chosen])
-        tables = [e.routes[k] for _, e, k in chosen]
+        item, _, when = torch.tensor(chosen).unbind(1)
+        tables = [each[i].routes[k] for i, k, _ in chosen]
         points, first, length = (torch.from_numpy(part).to(device) for part in packed(tables, 1))
         right = np.zeros(length.shape, np.bool_)
         for row, table in enumerate(tables):
             right[row, : len(table.right)] = table.right
-        state = torch.stack([e.states[k, int(t)] for (_, e, k), t in zip(chosen, when, strict=True)]).to(device)
-        item, agent = torch.tensor([i for i, _, _ in chosen]), torch.stack([e.agent[k] for _, e, k in chosen])
+        state = torch.stack([each[i].states[k, t] for i, k, t in chosen]).to(device)
+        agent = torch.stack([each[i].agent[k] for i, k, _ in chosen])
         where = item.to(device), when.to(device), agent.to(device), state
-        batch = expert_batch(self.scenes(items).to(device), *where, observation)
+        batch = expert_batch(self._placed(tuple(items), device), *where, observation)
         routes = FollowedRoutes(points, first[:, None], length[:, None])
         scale, turns = observation.distance_scale, observation.turns
         features, mask = route_choices(state[:, None], routes, scale, turns=turns)
@@ -384,17 +388,3 @@ def transitions(
     for part in (found, found.get("next")):
         part.set(keys.VALID, fit.known)
     return found[fit.known.any(-1)]
-
-
-def _seen_routes(
-    experts: Sequence[Experts], row: Int[Tensor, " M"], progress: Float[Tensor, " M"], state: Float[Tensor, "M 4"]
-) -> RouteWindow:
-    """Return the part that experts see of their routes, from states that may lie beside where they were."""
-    taken = logged_routes([table for expert in experts for table in expert.routes], row)
-    # An agent that is displaced along the route by some metres has come as far as where it is now.
-    near = torch.full_like(progress, DISPLACED)[:, None]
-    return taken.window(taken.progress(state[:, None, :2], progress[:, None], near))
-
-
-def _nbytes(scene: SceneBatch) -> int:
-    return sum(getattr(scene, name).nbytes for name in SceneBatch.__annotations__)

@@ -18,7 +18,7 @@ from symphony.collectors import BeamSearchCollector
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.observation import ObservationConfig
 from symphony.errors import ConfigError
-from symphony.learning.demonstrations import SceneDataset
+from symphony.learning.demonstrations import Fitted, SceneDataset
 from symphony.objectives import auc
 
 _LEARNED = (
@@ -74,6 +74,7 @@ class SearchReplay:
         self.period = every * (collector.env.batch_size[0] // self.rows)
         self._found: TensorDictBase | None = None
         self._leaves: TensorDictBase | None = None
+        self._fitted: Fitted | None = None
 
     def refresh(self, step: int) -> TensorDict:
         """Search if a search is due at an update, or was never made; return its :func:`search_statistics`."""
@@ -88,7 +89,7 @@ class SearchReplay:
             self._leaves = self._found[first : first + self.rows]
             self._statistics = search_statistics(self.env, self._leaves)
             self._searched = self._leaves[:, 0, 0].get(keys.SCENE).squeeze(-1)
-            self._scenes = self.env.scenes[self._searched]
+            self._scenes, self._fitted = self.env.scenes[self._searched], None
         return self._statistics
 
     @property
@@ -168,7 +169,8 @@ class SearchReplay:
 
     def _logged(self, count: int, rng: torch.Generator) -> TensorDict:
         scenes = self._scenes
-        state, logged, progress, *_ = self.data.fitted(scenes.segment.tolist(), scenes)
+        self._fitted = self._fitted or self.data.fitted(scenes.segment.tolist(), scenes)
+        state, logged, progress, *_ = self._fitted
         rows = logged[:, 1:].any(-1).nonzero()
         scene, step = rows[torch.randint(len(rows), (count,), generator=rng).to(rows.device)].unbind(-1)
         step = step + 1

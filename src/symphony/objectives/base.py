@@ -171,7 +171,9 @@ class ActorLoss(MaskedLoss):
         if not 0.0 <= label_smoothing < 1.0:
             raise ValueError(f"label_smoothing must be in [0, 1), is {label_smoothing}")
         self.convert_to_functional(actor_network, "actor_network")
-        self.categorical = _is_categorical(actor_network)
+        heads = [m for m in actor_network.modules() if isinstance(m, ProbabilisticTensorDictModule)]
+        kind = heads[-1].distribution_class if heads else None
+        self.categorical = isinstance(kind, type) and issubclass(kind, Categorical)  # or one-hot, as TorchRL's
         if label_smoothing and not self.categorical:
             raise ValueError("label_smoothing needs an actor whose distribution is a torch Categorical")
         self.label_smoothing = label_smoothing
@@ -202,7 +204,9 @@ class ActorLoss(MaskedLoss):
             return Fit(cost, cost.detach(), counted, None, None)
         nll = cost.detach()
         if self.label_smoothing:
-            cost = (1.0 - self.label_smoothing) * cost + self.label_smoothing * _even(dist.logits)
+            possible = dist.logits > -torch.inf  # over all these a share of the target is spread evenly
+            even = -torch.where(possible, dist.logits, 0.0).sum(-1) / possible.sum(-1)
+            cost = (1.0 - self.label_smoothing) * cost + self.label_smoothing * even
         with torch.no_grad():
             index = action.argmax(-1) if one_hot else action
             hit = (dist.logits.argmax(-1) == index).to(dist.logits.dtype)
@@ -213,23 +217,8 @@ class ActorLoss(MaskedLoss):
         if fit.entropy is None or fit.hit is None:
             return {}
         reduction: Reduction = "none" if self.reduction == "none" else "mean"
-        return {
-            "entropy": self._reduced(fit.entropy, counted, reduction),
-            "accuracy": self._reduced(fit.hit, counted, reduction),
-        }
-
-
-def _even(logits: Float[Tensor, "*b C"]) -> Float[Tensor, "*b"]:
-    """Return the negative log-likelihood of a target spread evenly over all possible categories."""
-    possible = logits > -torch.inf
-    return -torch.where(possible, logits, 0.0).sum(-1) / possible.sum(-1)
-
-
-def _is_categorical(actor: Any) -> bool:
-    """Return whether the actor's distribution is a torch Categorical (over indices, or one-hot as TorchRL's)."""
-    heads = [m for m in actor.modules() if isinstance(m, ProbabilisticTensorDictModule)]
-    kind = heads[-1].distribution_class if heads else None
-    return isinstance(kind, type) and issubclass(kind, Categorical)
+        parts = {"entropy": fit.entropy, "accuracy": fit.hit}
+        return {name: self._reduced(part, counted, reduction) for name, part in parts.items()}
 
 
 class BCLoss(ActorLoss):

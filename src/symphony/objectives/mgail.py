@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from symphony.objectives.base import MaskedLoss, Reduction
+from symphony.programs import compiled, ordered
 
 Cost = Literal["log_d", "non_saturating", "logit"]
 COSTS = {"log_d": functional.logsigmoid, "non_saturating": functional.softplus, "logit": lambda score: score}
@@ -43,6 +44,7 @@ class MGAILLoss(MaskedLoss):
             gradients pass through the actor's reactions too.
         truncate: steps after which the gradient is cut; 0: never.
         until_done: False if ends of episodes are to change nothing at all.
+        compile_step: compile actor, environment and score of a step, or how, as :func:`torch.compile` takes it.
         reduction: `"mean"` or `"sum"` over entries that count, or `"none"`, `[..., T, N]`.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
@@ -91,6 +93,7 @@ class MGAILLoss(MaskedLoss):
         detach_keys: Sequence[NestedKey] = (),
         truncate: int = 0,
         until_done: bool = True,
+        compile_step: bool | Mapping[str, Any] = False,
         reduction: Reduction | None = None,
         use_mask: bool | None = None,
     ) -> None:
@@ -104,6 +107,7 @@ class MGAILLoss(MaskedLoss):
         # Neither is trained here: in a container they are neither saved nor reset with the loss.
         self._held: dict[str, Any] = {"discriminator": discriminator, "env": env}
         self.horizon, self.cost, self.truncate, self.until_done = horizon, cost, truncate, until_done
+        self.compile_step = compile_step
         self.detach_keys = [key for key in detach_keys if key in actor_network.in_keys]
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -166,33 +170,41 @@ class MGAILLoss(MaskedLoss):
         self, env: EnvBase, now: TensorDictBase, numbers: Float[Tensor, "*_"] | None, steps: int
     ) -> tuple[Float[Tensor, "*b T N"], Bool[Tensor, "*b T N"]]:
         """Return logits and whether the episode still ran, `[..., steps, N]`."""
-        batch, scores, going = now.batch_dims, [], []
+        batch, scores, going, start = now.batch_dims, [], [], now
         alive = torch.ones_like(now.get(self.tensor_keys.done))
         frozen = {name: weight.detach() for name, weight in self.discriminator.named_parameters()}
-        with (
-            self.actor_network_params.to_module(self.actor_network),
-            set_exploration_type(ExplorationType.RANDOM),
-        ):
+        step = compiled(_step, env, self.compile_step) if self.compile_step else _step
+        written = [key for key in env.action_keys if key not in self.actor_network.in_keys]
+        with self.actor_network_params.to_module(self.actor_network), set_exploration_type(ExplorationType.RANDOM):
             for t in range(steps):
                 if self.truncate and t % self.truncate == 0:
                     now = now.detach()
-                acting = now.copy()
-                for key in self.detach_keys:
-                    acting.set(key, acting.get(key).detach())
-                if numbers is not None:
-                    acting.set(self.tensor_keys.noise, numbers.select(batch, t))
-                acting = self.actor_network(acting)
-                drawn = now.copy()
-                for key in env.action_keys:
-                    drawn.set(key, acting.get(key))
+                drawn = None if numbers is None else numbers.select(batch, t)
+                if self.compile_step:
+                    now, drawn = ordered(now.exclude(*written), start), None if drawn is None else drawn.contiguous()
                 # An environment may go on after an end, and a later state of it be invalid.
                 alive = alive & ~now.get(self.tensor_keys.done) if self.until_done else alive
-                now = env.step_mdp(env.step(drawn))
-                scored = functional_call(self.discriminator, frozen, (now.copy(),))
-                score = scored.get(self.tensor_keys.score, default=None)
-                if score is None:
-                    raise KeyError(f"the discriminator writes no score under {self.tensor_keys.score!r}")
+                now, score = step(self, env, frozen, now, drawn)
                 scores.append(score)
                 going.append(alive.flatten(batch) if score.ndim > batch else alive.squeeze(-1))
         score = torch.stack(scores, batch)
         return score, torch.stack(going, batch).expand_as(score)
+
+
+def _step(
+    loss: MGAILLoss, env: EnvBase, frozen: dict[str, Tensor], now: TensorDictBase, noise: Float[Tensor, "*_"] | None
+) -> tuple[TensorDictBase, Float[Tensor, "*b N"]]:
+    """Return the next state and its logits by the frozen weights of the discriminator; one program if compiled."""
+    names, acting, drawn = loss.tensor_keys, now.copy(), now.copy()
+    for key in loss.detach_keys:
+        acting.set(key, acting.get(key).detach())
+    if noise is not None:
+        acting.set(names.noise, noise)
+    acting = loss.actor_network(acting)
+    for key in env.action_keys:
+        drawn.set(key, acting.get(key))
+    now = env.step_mdp(env.step(drawn))
+    score = functional_call(loss.discriminator, frozen, (now.copy(),)).get(names.score, default=None)
+    if score is None:
+        raise KeyError(f"the discriminator writes no score under {names.score!r}")
+    return now, score

@@ -171,8 +171,13 @@ def collector_settings(
         **_settings(env, pruning_rule(config) if rule is None else rule),
         "frames_per_batch": segments * config.branches * data.decisions,
         "total_frames": -1,
-        "compile_step": COMPILER if data.few_shapes else False,
+        **compiled(data),
     }
+
+
+def compiled(data: SceneDataset) -> dict[str, Any]:
+    """Return the setting that compiles the steps of what learns from data, where its batches have few shapes."""
+    return {"compile_step": COMPILER if data.few_shapes else False}
 
 
 def search(

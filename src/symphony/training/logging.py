@@ -51,11 +51,7 @@ class Tracker:
         if mode != "disabled":
             import wandb as tracking  # noqa: PLC0415 - seconds to import, and often not wanted
 
-            how: Any = {
-                "project": os.environ.get("WANDB_PROJECT", "symphony"),
-                "name": folder.name,
-                "mode": mode,
-            }
+            how: Any = {"project": os.environ.get("WANDB_PROJECT", "symphony"), "name": folder.name, "mode": mode}
             how |= {"config": settings, "id": _run_id(folder, again=after > 0), "dir": str(folder)}
             how |= {"resume": "allow" if after else None}
             try:
