@@ -291,6 +291,7 @@ def problems_of(path: Path, *parts: str) -> list[RunSegment]:
     ('<lanelet ref="11"/>', (100, 0), 11),
     ('<lanelet ref="12"/>', (50 + 40 * np.sin(np.pi / 4), 40 - 40 * np.cos(np.pi / 4)), 12),
     (AREA, (90, 33), 12),
+    (AREA + "<circle><radius>2</radius><center><x>92</x><y>35</y></center></circle>", (91, 34), 12),
     ("<point><x>140</x><y>1</y></point>", (140, 1), 11),
 ])  # fmt: skip
 def test_the_ego_of_a_planning_problem_is_on_its_way_to_the_goal(path, tmp_path, goal, place, lane):

@@ -421,6 +421,17 @@ def lanes_that_end(pieces):
     return make_road(flat, links[:-1], left=beside[1], right=beside[-1])
 
 
+def test_a_route_ends_beside_a_lane_that_doubles_back():
+    road, steps = lanes_that_end([(1, 0.0), (1, 0.0)]), 6
+    broken = np.insert(road.lanes[1][:, :2], -1, [[40.0, LANE_WIDTH], [57.0, LANE_WIDTH]], 0)
+    lines = [broken if k == 1 else road.lanes[k][:, :2] for k in range(len(road.lanes))]
+    road = make_road(lines, [(1, 2), (2, 3)], left=[(0, 1)], right=[(1, 0)])
+    segment = make_segment(
+        road, np.full((1, steps, 2), [20.0, 0.0]), np.zeros((1, steps)), np.zeros((1, steps, 2)), 0.2
+    )
+    assert scene(segment, [0], LaneGraph(road)).route_point.isfinite().all()
+
+
 @settings(max_examples=2)
 @given(
     st.lists(st.tuples(st.sampled_from([-1, 1]), st.floats(-1.5, 1.5)), min_size=9, max_size=9),

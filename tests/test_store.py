@@ -63,7 +63,7 @@ def test_round_trip(found: list[RunSegment], split: int) -> None:
 
 def test_groups_and_tags_come_back_and_change_no_hash(folder: Path, tmp_path: Path) -> None:
     with StoreWriter(folder) as writer:
-        writer.append(straight_road(seed=1).replace(group="drive 1/ö"), tags={"n": 1})
+        writer.append(straight_road(seed=1).replace(group="drive 1/ö"), tags={"n": 1, "goal": "left"})
         writer.append(straight_road(seed=2))
         writer.append(straight_road(seed=3), tags={"network": "town-5"})
         with pytest.raises(DataError, match="cannot name a tag"):
@@ -73,7 +73,7 @@ def test_groups_and_tags_come_back_and_change_no_hash(folder: Path, tmp_path: Pa
     # One without a group is its own; the generator's networks of earlier releases are groups.
     assert store.groups.tolist() == ["drive 1/ö", "straight-2", "town-5", "r0", "r1", "r2"]
     assert [segment.group for segment in store] == store.groups.tolist()
-    assert [store.tags(i) for i in range(3)] == [{"n": 1}, {}, {"network": "town-5"}]
+    assert [store.tags(i) for i in range(3)] == [{"n": 1, "goal": "left"}, {}, {"network": "town-5"}]
     assert content_hash(store[0]) == content_hash(straight_road(seed=1))
     with StoreWriter(tmp_path / "copy") as writer:
         assert [writer.copy(store, k) for k in range(6)] == list(range(6))

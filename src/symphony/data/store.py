@@ -22,7 +22,7 @@ from symphony.data.store_format import MAPS, REPORT, SEGMENTS, Table, check_head
 from symphony.errors import DataError
 
 TWICE = "a segment of this name is in the store already"
-GROUP, GOAL, NETWORK = "group", "goal", "network"
+GROUP, GOAL, NETWORK = "group", "_goal", "network"
 """Tags under which a segment's group (also by the generator before there were groups) and its goal are kept."""
 
 

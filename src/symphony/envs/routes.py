@@ -154,7 +154,11 @@ def followed(
     last = point[(first + count - 1)[tuple(rows.T)]]
     for n, g in rows[(np.abs(last[:, None] - ends).max(-1) < SAME).any(-1)].tolist():
         line = point[first[n, g] : first[n, g] + count[n, g]].astype(np.float64)
-        if (more := carried_on(graph, line, length, speed[n])) is not None:
+        try:
+            more = carried_on(graph, line, length, speed[n])
+        except (ValueError, IndexError, ArithmeticError):
+            continue  # a lane that can't be followed: the route ends where it did
+        if more is not None:
             # Up to where it changes a route keeps its very points.
             same = int((more[: len(line)] == line[: len(more)]).all(-1).argmin())
             rest = resampled(more[max(same - 1, 0) :], SPACING, length - SPACING * max(same - 1, 0))

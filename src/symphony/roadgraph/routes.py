@@ -282,8 +282,9 @@ def carried_on(graph: LaneGraph, line: Reals, length: float, speed: float = 0.0)
         on = _onward(graph, rest, Route((other,)), length - float(arc[-1]) + within)
         target, reach = paths.centre_line(graph, on.lanes, places[other][0]), max(within, CHANGE_METRES)
         near = int(np.searchsorted(paths.arc_lengths(target), 1.5 * reach)) + 1  # it may come by here again
-        way = np.concatenate([paths.blend(target[:near], point, reach), target[near:]])
-        if places[other][1] > CHANGE_WIDTH or len(way) < 2:
+        with np.errstate(divide="ignore", invalid="ignore"):  # of a lane that doubles back; it is not followed
+            way = np.concatenate([paths.blend(target[:near], point, reach), target[near:]])
+        if places[other][1] > CHANGE_WIDTH or len(way) < 2 or not np.isfinite(way).all():
             break
         line = found = np.concatenate([line[arc < arc[-1] - within - 1e-3], way])
     return found

@@ -148,7 +148,10 @@ def _goal(node: ET.Element, segment: RunSegment) -> list[float] | None:
             line = segment.road.lanes[int(rows[0])][:, :2].astype(np.float64)
             return list(lines.evenly(line, 3)[1].tolist())
         point = place.find("point")
-        middle = _shape(place, field, "")[1] if point is None else np.array(_point(point, field))
+        if point is None:  # several shapes are one area
+            middle = np.mean([_shape([part], field)[1] for part in place], axis=0)
+        else:
+            middle = np.array(_point(point, field))
         return list((middle - segment.origin[:2]).tolist())
     return None
 
@@ -241,7 +244,7 @@ def _obstacle(node: ET.Element, moves: bool) -> tuple[int, int, Doubles, Box]:
     else:  # at rest whatever its file says
         log[:, [0, 4, 5]] = 0
     kind = _TYPES.get(_text(node, "type"), AgentType.OTHER)
-    return base.integer(node.get("id"), "obstacle id"), kind, log, _shape(node, f"{name}: shape")
+    return base.integer(node.get("id"), "obstacle id"), kind, log, _shape(node.findall("shape/*"), f"{name}: shape")
 
 
 def _state(node: ET.Element, name: str, moves: bool) -> tuple[float, ...]:
@@ -276,8 +279,7 @@ def _rotated(vectors: Doubles, angle: Doubles | float) -> Doubles:
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def _shape(node: ET.Element, field: str, below: str = "shape/") -> Box:
-    parts = node.findall(f"{below}*")
+def _shape(parts: list[ET.Element], field: str) -> Box:
     known = [part for part in parts if part.tag in {"rectangle", "circle", "polygon"}]
     refuse(len(parts) != 1 or parts != known, "expected one rectangle, circle or polygon", field)
     (part,) = parts
