@@ -16,7 +16,16 @@ from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
 from helpers_collectors import Mass
-from symphony.collectors import BeamSearchCollector, BeamSearchPlanner, KeepAll, KeepBest, KeyScore, with_rows
+from symphony.collectors import (
+    BeamSearchCollector,
+    BeamSearchPlanner,
+    KeepAll,
+    KeepBest,
+    KeyScore,
+    beam_search,
+    branch,
+    with_rows,
+)
 
 ROWS, STEPS = 3, 8
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore:.*VecNormV2:FutureWarning")
@@ -220,6 +229,16 @@ def test_without_pruning_it_is_the_best_of_all_branches(valued, limit):
     torch.testing.assert_close(planned["planner", "weight"], torch.softmax(expected / 0.5, -1))
     torch.testing.assert_close(planned["planner", "value"].squeeze(-1), expected.amax(-1))
     torch.testing.assert_close(planned["planner", "action"], actions)
+
+
+def test_the_last_period_of_an_episode_is_the_last_of_its_row():
+    """Whatever other rows go on to: nothing is pruned after it."""
+    env = envs.TransformedEnv(with_rows(Mass(limit=9.0), [ROWS]), envs.StepCounter(4))
+    start = branch(env.reset(), BRANCHES)
+    given, how = (env, hashed, KeyScore("reward", negate=True)), {"prune_every": 2, "prune_last": False}
+    short, long = (beam_search(*given, start.clone(), steps=steps, **how) for steps in (4, 8))
+    assert (short.parents[:, 0] != torch.arange(BRANCHES)).any()
+    assert torch.equal(short.parents, long.parents[:, :2])
 
 
 def test_agents_of_a_group_are_planned_for():

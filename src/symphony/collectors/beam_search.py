@@ -193,7 +193,8 @@ def beam_search(
             worth = None if run.worth is None else torch.where(ended.all(-1), worth, run.worth).detach()
             last = period == len(periods) - 1
             active = run.alive[..., 0, :].any(-1).any(-1)
-            parents = pruning.prune(simulation.total(run), active, worth, keep_all=last and not prune_last)
+            kept = None if prune_last else last | run.ended.flatten(-2).all(-1)  # rows whose last period this was
+            parents = pruning.prune(simulation.total(run), active, worth, kept)
             if not last:
                 place = _places(parents, start)
                 now, ended = take(run.after, place), take_values(run.ended, place, start.ndim)

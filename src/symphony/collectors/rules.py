@@ -342,20 +342,18 @@ class Pruning:
         totals: Float[Tensor, "*b S"],
         active: Bool[Tensor, "*b"],
         worth: Float[Tensor, "*b S"] | None = None,
-        *,
-        keep_all: bool = False,
+        kept: Bool[Tensor, "*b"] | None = None,
     ) -> Int[Tensor, "*b S"]:
         """Return the parents of the slots after a period, which went on in `active` rows and led to states of value
-        `worth`; the slots themselves if all are kept.
+        `worth`; the slots themselves in rows that are `kept`.
         """
         carried = totals.detach() if self._carried is None else self._carried + totals.detach()
         seen = carried if worth is None else carried + worth
-        slots, moves = _slots(seen), torch.zeros_like(active) if keep_all else active
-        if not keep_all:
-            parents = checked(self.rule, seen, self._noises[len(self.parents)], self._groups)
-            moves = moves if self.weighs is None else moves & self.weighs.resamples(seen)
-            slots = torch.where(moves[..., None], parents, slots)
-            self._groups = None if self._groups is None else self._groups.gather(-1, slots)
+        moves = active if kept is None else active & ~kept
+        parents = checked(self.rule, seen, self._noises[len(self.parents)], self._groups)
+        moves = moves if self.weighs is None else moves & self.weighs.resamples(seen)
+        slots = torch.where(moves[..., None], parents, _slots(seen))
+        self._groups = None if self._groups is None else self._groups.gather(-1, slots)
         if self.weighs is not None:
             weights = -seen.double() / self.weighs.temperature
             self.log_weights.append(weights)
