@@ -237,7 +237,9 @@ def test_the_last_period_of_an_episode_is_the_last_of_its_row():
     start = branch(env.reset(), BRANCHES)
     given, how = (env, hashed, KeyScore("reward", negate=True)), {"prune_every": 2, "prune_last": False}
     short, long = (beam_search(*given, start.clone(), steps=steps, **how) for steps in (4, 8))
-    assert (short.parents[:, 0] != torch.arange(BRANCHES)).any()
+    slots = torch.arange(BRANCHES).expand(ROWS, -1)
+    assert (short.parents[:, 0] != slots).any()
+    assert torch.equal(short.parents[:, 1], slots)
     assert torch.equal(short.parents, long.parents[:, :2])
 
 

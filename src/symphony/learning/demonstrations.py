@@ -141,9 +141,7 @@ class SceneDataset:
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
         self.routes, self.duration, self.keep, self.few_shapes = routes, duration, keep, few_shapes
-        size = lambda one: sum(getattr(one, name).nbytes for name in SceneBatch.__annotations__)  # noqa: E731
-        prepare = lambda items: [self._scene(i) for i in items]  # noqa: E731
-        self.scene = ItemCache(prepare, size, keep=keep, name="prepared run segments")
+        self.scene = ItemCache(self._prepared, _nbytes, keep=keep, name="prepared run segments")
         self.experts = ItemCache(self.fit, attrgetter("nbytes"), keep=keep, name="demonstrations")
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
@@ -216,6 +214,9 @@ class SceneDataset:
     def _scene(self, i: int) -> SceneBatch:
         graph, segment = self.graph(i) if self.routes else None, self.segment(i)
         return scene(segment, self.interactive, graph, number=i)
+
+    def _prepared(self, items: Sequence[int]) -> list[SceneBatch]:
+        return [self._scene(i) for i in items]
 
     def scenes(self, items: Sequence[int]) -> SceneBatch:
         """Return several items as one padded batch."""
@@ -388,3 +389,7 @@ def transitions(
     for part in (found, found.get("next")):
         part.set(keys.VALID, fit.known)
     return found[fit.known.any(-1)]
+
+
+def _nbytes(scene: SceneBatch) -> int:
+    return sum(getattr(scene, name).nbytes for name in SceneBatch.__annotations__)
