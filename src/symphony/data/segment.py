@@ -298,7 +298,7 @@ def _checks(s: RunSegment) -> Iterator[Check]:
     yield from _array("origin", s.origin, (3,), np.float64)
     place = s.goal is None or (isinstance(s.goal, list) and [type(x) for x in s.goal] == [float, float])
     place = place and all(abs(x) < MAX_COORDINATE for x in s.goal or ())
-    yield "goal", place, "must be None or x and y, near the origin"
+    yield "goal", place, "must be None or a list of x and y, floats near the origin"
     yield "logged", 0 <= s.logged <= steps, f"{s.logged} outside the {steps} steps"
     yield "current_step", 0 <= s.current_step < steps, f"{s.current_step} outside the {steps} steps"
     sides = MIN_SIZE, MAX_SIZE
