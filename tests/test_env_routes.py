@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from symphony.envs.scene import leaving, map_edge
 from symphony.errors import DataWarning
 from symphony.geometry.boxes import box_gap
 from symphony.geometry.polylines import stations_along
+from symphony.learning.experts import KeptExperts, fit_experts
 from symphony.roadgraph import LaneGraph
 from symphony.roadgraph.paths import sharpest
 from symphony.roadgraph.routes import change_length
@@ -430,6 +432,27 @@ def test_a_route_ends_beside_a_lane_that_doubles_back():
         road, np.full((1, steps, 2), [20.0, 0.0]), np.zeros((1, steps)), np.zeros((1, steps, 2)), 0.2
     )
     assert scene(segment, [0], LaneGraph(road)).route_point.isfinite().all()
+
+
+def test_an_expert_that_goes_on_past_the_end_of_its_lane_is_not_left_there(tmp_path):
+    road, x = lanes_that_end([(1, 0.0), (1, 0.0)]), np.arange(20.0, 155.0, 2.0)
+    # It changes lanes twice; the routes among which one is chosen do so once.
+    y = LANE_WIDTH * (((x - 30) / 25).clip(0, 1) + ((x - 105) / 30).clip(0, 1))
+    path, heading = np.stack([x, y], -1), np.arctan2(np.gradient(y), np.gradient(x))
+    velocity = 10 * np.stack([np.cos(heading), np.sin(heading)], -1)
+    (expert,) = fit_experts(
+        [make_segment(road, path[None], heading[None], velocity[None], 0.2)], Bicycle(), routes=True
+    )
+    (table,) = expert.routes
+    assert table.line(table.logged)[-1, 0] < x[-1] < table.followed(table.logged)[-1, 0]
+    assert np.abs(expert.progress[0].numpy() - (x - 20)).max() < 3
+    kept = KeptExperts(tmp_path, "")
+    kept.save("one", expert)
+    (other,) = kept.load("one").routes
+    assert np.array_equal(other.followed(table.logged), table.followed(table.logged))
+    assert expert.nbytes > dataclasses.replace(expert, routes=()).nbytes + table.points.nbytes + sum(
+        line.nbytes for line in table.carried.values()
+    )
 
 
 @settings(max_examples=2)

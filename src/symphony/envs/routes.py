@@ -7,9 +7,9 @@ the part of it that is seen, N agents, M rows.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -56,11 +56,17 @@ class RouteTable:
     count: NDArray[np.int64]  # [G] points of each
     right: NDArray[np.bool_]  # [G] those nearest to the log; several where they part beyond its end
     logged: int  # one of these, drawn from segment and agent alone; -1 where the vehicle is on no lane
+    carried: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
+    """What vehicles follow [K, 2] of routes that end beside lanes that go on, by number of the route."""
 
     def line(self, route: int) -> NDArray[np.float32]:
         """Return points [K, 2] of one route."""
         begin = int(self.count[:route].sum())
         return self.points[begin : begin + int(self.count[route])]
+
+    def followed(self, route: int) -> NDArray[np.float32]:
+        """Return points [K, 2] of what a vehicle on a route follows."""
+        return self.carried[route] if route in self.carried else self.line(route)
 
 
 NO_ROUTES = RouteTable(np.zeros((0, 2), np.float32), np.zeros(0, np.int64), np.zeros(0, np.bool_), -1)
@@ -107,7 +113,31 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
     tied = np.flatnonzero(right)
     draw = stream_of(f"route {segment.segment_id} {segment.agent_id[agent]}") % len(tied)
     count = np.array([len(line) for line in lines], np.int64)
-    return RouteTable(np.concatenate(lines).astype(np.float32), count, right, int(tied[draw]))
+    kept = [line.astype(np.float32) for line in lines]
+    carried = _carried(graph, kept, length, speed)
+    return RouteTable(np.concatenate(kept), count, right, int(tied[draw]), carried)
+
+
+def _carried(
+    graph: LaneGraph, lines: Sequence[NDArray[np.float32]], length: float, speed: float
+) -> dict[int, NDArray[np.float32]]:
+    """Return what is followed of those lines that end beside lanes that go on, by their number
+    (:func:`symphony.roadgraph.routes.carried_on`).
+    """
+    ends, found = np.array([graph.lines[lane][-1] for lane in graph.drops], np.float32).reshape(-1, 2), {}
+    for number, line in enumerate(lines):
+        if len(line) < 2 or np.abs(ends - line[-1]).max(1).min(initial=np.inf) >= SAME:
+            continue
+        try:
+            more = carried_on(graph, line.astype(np.float64), length, speed)
+        except (ValueError, IndexError, ArithmeticError):
+            continue  # a lane that can't be followed: the route ends where it did
+        if more is not None:
+            # Up to where it changes a route keeps its very points.
+            same = max(int((more[: len(line)] == line[: len(more)]).all(-1).argmin()) - 1, 0)
+            rest = resampled(more[same:], SPACING, length - SPACING * same)
+            found[number] = np.concatenate([line[:same], rest]).astype(np.float32)
+    return found
 
 
 def _starts(segment: RunSegment, graph: LaneGraph, agent: int, step: int) -> list[tuple[int, float]]:
@@ -124,47 +154,31 @@ def _starts(segment: RunSegment, graph: LaneGraph, agent: int, step: int) -> lis
     return kept or starts
 
 
-def packed(tables: Sequence[RouteTable], least: int = 0) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return points [R, 2] of all routes of N agents, the place among them of each route's first [N, G], and how many
-    it has [N, G], 0 for padding; G is at least ``least``.
-    """
+class Packed(NamedTuple):
+    """All routes of N agents in one list of points; G is that of the agent with the most, the rest padding."""
+
+    point: NDArray[np.float32]  # [R, 2]
+    first: NDArray[np.int64]  # [N, G] place in the list of the first point of each route
+    length: NDArray[np.int64]  # [N, G] points of each; 0 for padding
+    follow_first: NDArray[np.int64]  # [N, G] the same of what is followed of each
+    follow_length: NDArray[np.int64]  # [N, G]
+
+
+def packed(tables: Sequence[RouteTable], least: int = 0) -> Packed:
+    """Return the routes of N agents; G is at least ``least``."""
     most = max([least, *(len(table.count) for table in tables)])
     count = np.zeros((len(tables), most), np.int64)
     for row, table in zip(count, tables, strict=True):
         row[: len(table.count)] = table.count
     first = (count.cumsum() - count.ravel()).reshape(count.shape) * (count > 0)
-    return np.concatenate([np.zeros((0, 2), np.float32), *(t.points for t in tables)]), first, count
-
-
-def followed(
-    segment: RunSegment,
-    graph: LaneGraph,
-    speed: Sequence[float],
-    point: NDArray[Any],
-    first: NDArray[Any],
-    count: NDArray[Any],
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """The same as :func:`packed` of what N agents with speeds [N] follow: their routes, which are carried on where
-    they end beside lanes that go on (:func:`symphony.roadgraph.routes.carried_on`).
-    """
-    first, count = first.copy(), count.copy()
-    length, parts, begin = max(HORIZON, drivable(segment, segment.num_steps) + ONWARD), [point], len(point)
-    ends = np.array([graph.lines[lane][-1] for lane in graph.drops], np.float32).reshape(-1, 2)
-    rows = np.argwhere(count > 1)
-    last = point[(first + count - 1)[tuple(rows.T)]]
-    for n, g in rows[(np.abs(last[:, None] - ends).max(-1) < SAME).any(-1)].tolist():
-        line = point[first[n, g] : first[n, g] + count[n, g]].astype(np.float64)
-        try:
-            more = carried_on(graph, line, length, speed[n])
-        except (ValueError, IndexError, ArithmeticError):
-            continue  # a lane that can't be followed: the route ends where it did
-        if more is not None:
-            # Up to where it changes a route keeps its very points.
-            same = int((more[: len(line)] == line[: len(more)]).all(-1).argmin())
-            rest = resampled(more[max(same - 1, 0) :], SPACING, length - SPACING * max(same - 1, 0))
-            parts.append(np.concatenate([line[: max(same - 1, 0)], rest]).astype(np.float32))
-            first[n, g], count[n, g], begin = begin, len(parts[-1]), begin + len(parts[-1])
-    return np.concatenate(parts), first, count
+    follow_first, follow_count = first.copy(), count.copy()
+    parts, begin = [np.zeros((0, 2), np.float32), *(t.points for t in tables)], int(count.sum())
+    for k, table in enumerate(tables):
+        for number, line in table.carried.items():
+            follow_first[k, number], follow_count[k, number] = begin, len(line)
+            parts.append(line)
+            begin += len(line)
+    return Packed(np.concatenate(parts), first, count, follow_first, follow_count)
 
 
 def logged_progress(
@@ -174,7 +188,7 @@ def logged_progress(
     found = np.zeros(valid.shape, np.float32)
     rows = [row for row, table in enumerate(tables) if table.logged >= 0]
     if rows:
-        lines = [tables[row].line(tables[row].logged) for row in rows]
+        lines = [tables[row].followed(tables[row].logged) for row in rows]
         most = max(2, *map(len, lines))
         padded = np.stack([np.pad(line, ((0, most - len(line)), (0, 0)), "edge") for line in lines])
         places = stations_along(padded.astype(np.float64), position[rows].astype(np.float64), valid[rows])
@@ -188,7 +202,7 @@ class Routes(NamedTuple):
     point: Tensor  # [B, R, 2]
     first: Tensor  # [B, N, G] int64 place in the list of the first point of each route
     length: Tensor  # [B, N, G] int64 points of each; 0 for padding
-    followed: tuple[Tensor, Tensor]  # [B, N, G] the same of what agents follow, see :func:`followed`
+    followed: tuple[Tensor, Tensor]  # [B, N, G] the same of what agents follow, see :class:`RouteTable`
 
     def of(self, scene: Int[Tensor, " M"], goal: Int[Tensor, "M N"]) -> FollowedRoutes:
         """Return the routes that agents follow: none where there is no route of that number."""

@@ -22,7 +22,7 @@ from torch import Tensor
 from symphony.data.levels import Levels, agent_heights, levels_of
 from symphony.data.segment import AgentType, LaneType, MarkType, Polylines, RunSegment, SignalState
 from symphony.data.selection import interactive_agents
-from symphony.envs.routes import NO_ROUTES, Routes, followed, packed, route_table
+from symphony.envs.routes import NO_ROUTES, Routes, packed, route_table
 from symphony.errors import DataError
 from symphony.geometry.cells import EdgeCells, PointCells
 from symphony.geometry.nearest import spans
@@ -227,11 +227,7 @@ def scene(
     if graph is not None:
         pairs = zip(chosen.tolist(), enter.tolist(), strict=True)
         tables = [route_table(segment, graph, agent, at) for agent, at in pairs]
-    point, *whole = packed(tables)
-    lines = whole
-    if graph is not None:
-        speed = np.linalg.norm(segment.velocity[chosen, enter], axis=-1)
-        point, *lines = followed(segment, graph, speed.tolist(), point, *whole)
+    taken = packed(tables)
     moving = segment.position[..., :2], segment.heading[..., None], segment.velocity
     levels = levels_of(segment)
     fields: dict[str, Any] = {
@@ -254,8 +250,11 @@ def scene(
         "dt": np.float64(segment.dt),
         **_edges(segment.road.boundary, levels),
         **_points(segment, levels),
-        "route_point": point,
-        **dict(zip(("route_first", "route_count", "follow_first", "follow_count"), whole + lines, strict=True)),
+        "route_point": taken.point,
+        "route_first": taken.first,
+        "route_count": taken.length,
+        "follow_first": taken.follow_first,
+        "follow_count": taken.follow_length,
         "route_logged": np.array([table.logged for table in tables], np.int64),
     }
     return SceneBatch(

@@ -310,7 +310,7 @@ class SceneDataset:
         chosen = [found[k] for k in pick]
         item, _, when = torch.tensor(chosen).unbind(1)
         tables = [each[i].routes[k] for i, k, _ in chosen]
-        points, first, length = (torch.from_numpy(part).to(device) for part in packed(tables, 1))
+        points, first, length = (torch.from_numpy(part).to(device) for part in packed(tables, 1)[:3])
         right = np.zeros(length.shape, np.bool_)
         for row, table in enumerate(tables):
             right[row, : len(table.right)] = table.right

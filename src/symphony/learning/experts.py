@@ -37,7 +37,7 @@ from symphony.roadgraph import LaneGraph, lane_of
 IN_LANE = 1.0
 """Metres from a centre line within which a standing vehicle is taken to wait rather than to be parked."""
 
-VERSION = 3
+VERSION = 4
 """Version of the fit: raised when it gives other numbers or routes for the same segment (a test says when)."""
 PACKAGE = Path(symphony.__file__).parent
 _TENSORS = ("agent", "states", "actions", "valid", "error", "progress")
@@ -72,8 +72,9 @@ class Experts:
     def nbytes(self) -> int:
         """The bytes that it takes in memory."""
         tensors = (self.agent, self.states, self.actions, self.valid, self.error, self.progress)
-        tables = (part for table in self.routes for part in (table.points, table.count, table.right))
-        return sum(part.nbytes for part in (*tensors, *tables))
+        tables = sum(t.points.nbytes + t.count.nbytes + t.right.nbytes for t in self.routes)
+        carried = sum(line.nbytes for t in self.routes for line in t.carried.values())
+        return sum(part.nbytes for part in tensors) + tables + carried
 
 
 def fit_experts(
@@ -171,7 +172,7 @@ def _fit_together(
 def logged_routes(tables: Sequence[RouteTable], row: Int[Tensor, " M"]) -> FollowedRoutes:
     """Return the routes that experts took, one expert in each row [M, 1]."""
     none = np.zeros((0, 2), np.float32)
-    lines = [table.line(table.logged) if table.logged >= 0 else none for table in tables]
+    lines = [table.followed(table.logged) if table.logged >= 0 else none for table in tables]
     count = torch.tensor([len(line) for line in lines])
     begin = count.cumsum(0) - count
     return FollowedRoutes(torch.from_numpy(np.concatenate(lines)), begin[row][:, None], count[row][:, None])
@@ -260,12 +261,15 @@ class KeptExperts:
             ends = arrays["route_number"].cumsum()
             # Points of the routes of each agent end where those of its last route do.
             point_ends = np.append(0, arrays["route_count"].cumsum())[np.append(0, ends)]
+            carried = np.split(arrays["carried_points"], arrays["carried_count"].cumsum()[:-1])
+            followed = dict(zip(arrays["carried_route"].tolist(), carried, strict=False))
             tables = tuple(
                 RouteTable(
                     arrays["route_points"][point_ends[k] : point_ends[k + 1]],
                     arrays["route_count"][end - count : end],
                     arrays["route_right"][end - count : end],
                     int(arrays["route_logged"][k]),
+                    {g: followed[end - count + g] for g in range(count) if end - count + g in followed},
                 )
                 for k, (end, count) in enumerate(zip(ends, arrays["route_number"], strict=True))
             )
@@ -278,12 +282,18 @@ class KeptExperts:
         path, routes = self._path(content), experts.routes
         if path is None or not self.writable:
             return
+        # Routes that are carried on, by their places among those of all agents.
+        begin = np.cumsum([0, *(len(table.count) for table in routes)])
+        carried = {int(begin[k]) + g: line for k, table in enumerate(routes) for g, line in table.carried.items()}
         arrays = {name: getattr(experts, name).numpy() for name in _TENSORS} | {
             "route_number": np.array([len(table.count) for table in routes], np.int64),
             "route_points": np.concatenate([np.zeros((0, 2), np.float32), *(t.points for t in routes)]),
             "route_count": np.concatenate([np.zeros(0, np.int64), *(t.count for t in routes)]),
             "route_right": np.concatenate([np.zeros(0, np.bool_), *(t.right for t in routes)]),
             "route_logged": np.array([table.logged for table in routes], np.int64),
+            "carried_route": np.array(list(carried), np.int64),
+            "carried_count": np.array([len(line) for line in carried.values()], np.int64),
+            "carried_points": np.concatenate([np.zeros((0, 2), np.float32), *carried.values()]),
         }
         try:
             with replacing(path) as draft, zipfile.ZipFile(draft, "w") as file:
