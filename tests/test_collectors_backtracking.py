@@ -62,7 +62,7 @@ def test_what_is_never_bad_is_independent(rows, branches, steps, every):
 def test_a_rule_that_can_be_met_is_met(keep):
     start = starts(Walk(), 5, branches=4)
     start.set(X, 0.3 * start.get(X))  # or some begin where the first step is bad, whatever is drawn
-    rule = replace(RULE, back=(1, 2, 3, 0), cap=100, renew=rebuilt if keep else other_numbers)
+    rule = replace(RULE, back=(1, 2, 3, *[0] * 60), cap=100, renew=rebuilt if keep else other_numbers)
     how = {"score": lambda state: (distance(state) > 1.2).float(), "keep": keep}
     before, after = look(start, KeepAll(), **how), look(start, rule, **how)
     assert (before.totals > 0).any(-2).float().mean() > 0.5
@@ -123,12 +123,30 @@ def course(rule: Backtrack, bad: Any) -> tuple[list[tuple[int, int]], int]:
 
 def test_the_course_of_a_line():
     """One step is bad, always: a little back, farther, to the start, again to the start, and on at last."""
-    places, simulated = course(Backtrack(0.0, (1, 3, 0), cap=2), lambda step, tries: step == 9)
-    # 1 + 3 + 5 + 5 + 5 + 5 of 10 periods are more than twice a line.
-    assert places == [(8, 1), (4, 2), (0, 3), (0, 4), (0, 5), (0, 6)]
-    assert simulated == 20 + 2 * 24
-    places, _ = course(Backtrack(0.0, (1, 3, 0), cap=0.5), lambda step, tries: step == 9)
-    assert places == [(8, 1), (4, 2), (0, 3)]
+    rule = Backtrack(0.0, (1, 3, 0, 0), cap=2)
+    places, simulated = course(rule, lambda step, tries: step == 9)
+    assert places == [(8, 1), (4, 2), (0, 3), (0, 4)]
+    assert simulated == 20 + 2 * (1 + 3 + 5 + 5)
+    places, _ = course(replace(rule, cap=0.3), lambda step, tries: step == 9)
+    # 1 + 3 of 10 periods are more than that.
+    assert places == [(8, 1), (4, 2)]
+
+
+def test_agents_that_can_do_no_better_are_excused_and_hide_no_others():
+    """The first walker is always bad; the second can do better."""
+    start, rule = starts(Walk(), 6, branches=3), replace(RULE, back=(1, 3, 0, 0), cap=20)
+    start.set(X, 0.3 * start.get(X))
+
+    def score(state: TensorDictBase) -> Tensor:
+        second = (distance(state)[..., 1:] > 1.2).float()
+        return torch.cat([torch.ones_like(second), second], -1)
+
+    free, found = (look(start, rule, score=score) for rule in (KeepAll(), rule))
+    assert (found.scores[..., 0] == 1).all()
+    assert (found.totals >= 1).all()
+    bad, left = ((each.scores[..., 1] > 0).any(-1).float().mean() for each in (free, found))
+    assert bad > 0.5 > 3 * left
+    assert found.simulated_steps < 3 * free.simulated_steps
 
 
 def test_once_past_its_trouble_a_line_counts_anew():
@@ -143,7 +161,7 @@ def test_once_past_its_trouble_a_line_counts_anew():
 @pytest.mark.parametrize("cap", [0.0, 3.0])
 def test_what_cannot_be_met_ends(cap):
     start, plain = starts(Walk(), 3, branches=2), 3 * 2 * 12
-    rule = replace(RULE, back=(1, 0), cap=cap)
+    rule = replace(RULE, back=(1, *[0] * 9), cap=cap)
     found = look(start, rule, score=lambda state: (distance(state) > -1).float())
     assert plain <= found.simulated_steps <= plain * (2 + cap)
     assert (found.totals == 2).all()

@@ -2,6 +2,7 @@
 
 Copying good branches over bad ones makes rollouts alike; here nothing is copied from another line. After every T_p
 steps the lines whose total is above a threshold go back, with every failed try farther, in the end to the start.
+Where all tries have failed, the line goes on, and the agents whose trouble it was are excused.
 
 Legend: M lines (all rows and branches), R lines under way, P periods of T_p steps, N agents.
 """
@@ -28,12 +29,14 @@ class Backtrack:
 
     A line is bad if it ends a period with a total above the threshold, or NaN. The first time it goes back `back[0]`
     periods from there; if it is bad again before it has come `back[0]` good periods past that place `back[1]`, and so
-    on, and then the last of them again and again. Once it has been simulated `cap` times over, it goes on as it is.
+    on. After the last of them the agents whose score was the worst at all tries are excused: the line goes on, and
+    from then on it is judged by the others. So an agent that cannot do better, such as one that starts off the road,
+    neither costs more nor hides others. The scores and totals that are returned are those of all agents.
 
     Args:
         threshold: the threshold in the units of the totals.
-        back: periods, counted from the end of the bad one (1 repeats that alone); 0 for the first state.
-        cap: bound on what is simulated again, in lengths of a line, and on the cost of starts where all goes wrong.
+        back: periods of each try, counted from the end of the bad one (1 repeats that alone); 0 for the first state.
+        cap: bound on what is simulated again, in lengths of a line.
         renew: ``renew(state, attempt) -> state`` makes the state [R, 1] that lines go on from. It gets the kept
             entries of the step they go back to and how often each line [R] has gone back so far, and must give them
             other random numbers than before, and what was not kept of the entries that the start state has. None
@@ -43,7 +46,7 @@ class Backtrack:
     """
 
     threshold: float
-    back: tuple[int, ...] = (3, 5, 10, 0)
+    back: tuple[int, ...] = (3, 5, 10, 0, 0)
     cap: float = 6.0
     renew: Renew | None = None
     width: int | None = None
@@ -56,23 +59,37 @@ class Backtrack:
 
 
 class Course:
-    """The next period `at` of each line [M], and how often it has gone back, `times`."""
+    """The next period `at` of each line [M], how often it went back, `times`, which agents are `excused`, and which
+    may be as they were bad at all its tries, `blame`.
+    """
 
-    def __init__(self, rule: Backtrack, lines: int, periods: int, device: torch.device) -> None:
+    def __init__(self, rule: Backtrack, lines: int, agents: int, periods: int, device: torch.device) -> None:
         self.rule, self.periods = rule, periods
         self.back = torch.tensor(rule.back, device=device)
         # Tries since it passed its last bad period, the place of that, and periods simulated again.
         self.at, self.times, self.tries, self.front, self.again = torch.zeros(
             5, lines, dtype=torch.int64, device=device
         )
+        self.excused, self.blame = torch.zeros(2, lines, agents, dtype=torch.bool, device=device)
 
-    def judge(self, line: Int[Tensor, " R"], bad: Bool[Tensor, " R"]) -> Bool[Tensor, " R"]:
-        """Move lines to their next periods, given whether the period they ended was bad; return which go back."""
+    def judge(
+        self, line: Int[Tensor, " R"], bad: Bool[Tensor, " R"], worst: Bool[Tensor, "R N"]
+    ) -> Bool[Tensor, " R"]:
+        """Move lines to their next periods, given whether the period they ended was bad, and whose trouble that was;
+        return which go back.
+        """
         at, tries, front = self.at[line], self.tries[line], self.front[line]
-        goes = bad & (self.again[line] < self.rule.cap * self.periods)
+        blame = torch.where((tries == 0)[:, None], worst, worst & self.blame[line])
+        failed = bad & (tries >= len(self.back))
+        # Those who were bad at every try; the others are in trouble for the first time.
+        excused = torch.where(blame.any(-1, keepdim=True), blame, worst) & failed[:, None]
+        rest, tries = worst & ~excused, torch.where(failed, 0, tries)
+        goes = bad & rest.any(-1) & (self.again[line] < self.rule.cap * self.periods)
         back = self.back[tries.clamp_max(len(self.back) - 1)]
         to = torch.where(back == 0, 0, (at + 1 - back).clamp_min(0))
         past = ~bad & (at >= front + self.rule.back[0])
+        self.excused[line] |= excused
+        self.blame[line] = torch.where(failed[:, None], rest, torch.where(bad[:, None], blame, self.blame[line]))
         self.tries[line] = torch.where(past, 0, tries + goes)
         self.front[line] = torch.where(goes, torch.maximum(front, at), front)
         self.again[line] += torch.where(goes, at + 1 - to, 0)
@@ -113,20 +130,25 @@ def follow(
     lines, device = start.numel(), ended.device
     periods, short = -(-steps // every), steps % every
     entries, length = list(start.keys(True, True)), periods * every
-    course = Course(rule, lines, periods, device)
     waiting = torch.arange(lines, device=device)
     line, waiting = waiting[: rule.width], waiting[rule.width or lines :]
     now, over = take(start, line[:, None]), take_values(ended, line[:, None], start.ndim)
     simulated = line.new_zeros(())
     history: TensorDictBase | None = None
     while len(line):
-        at = course.at[line]
         run = simulate(now, over, every)
-        totals = total(run)[:, 0]
+        if history is None:
+            course = Course(rule, lines, run.scores.shape[-1], periods, device)
+        at, excused = course.at[line], course.excused[line]
         ending = (at == periods - 1) & (short > 0)
+        judged = run._replace(scores=run.scores.masked_fill(excused[:, None, None], 0.0))
+        totals, those = total(run)[:, 0], total(judged)[:, 0]
+        worst = judged.scores[:, 0].amax(1)
         if short:
             # The last period is simulated as long as the others: what lies past its end is neither counted nor kept.
             totals = torch.where(ending, total(run, short)[:, 0], totals)
+            those = torch.where(ending, total(judged, short)[:, 0], those)
+            worst = torch.where(ending[:, None], judged.scores[:, 0, :short].amax(1), worst)
         simulated = simulated + every * len(line) - ending.sum() * (every - short)
         alive = run.alive.any(-1)
         if history is None:
@@ -142,7 +164,8 @@ def follow(
             all_alive.index_copy_(0, place + k, alive[:, 0, k])
         all_totals.index_copy_(0, line * periods + at, totals)
         # An episode that has ended can't be bad any more; a line that goes back goes to before its end.
-        goes = course.judge(line, ~(totals <= rule.threshold) & alive[:, 0, 0]).nonzero().squeeze(-1)
+        bad = ~(those <= rule.threshold) & alive[:, 0, 0]
+        goes = course.judge(line, bad, ~(worst < worst.amax(-1, keepdim=True))).nonzero().squeeze(-1)
         now, over = run.after.select(*entries), run.ended.index_fill(0, goes, False)
         if len(goes):
             who = line[goes]
