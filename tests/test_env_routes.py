@@ -434,6 +434,15 @@ def test_a_route_ends_beside_a_lane_that_doubles_back():
     assert scene(segment, [0], LaneGraph(road)).route_point.isfinite().all()
 
 
+@pytest.mark.parametrize(("aside", "speed", "found"), [(2.9, 0, True), (4, 8, True), (4, 1, False), (6.1, 8, False)])
+def test_who_drives_beside_its_lane_is_on_it(aside, speed, found):
+    segment = straight_road(num_agents=1, steps=3, num_lanes=1)
+    position, velocity = segment.position.copy(), segment.velocity.copy()
+    position[..., 1], velocity[..., 0] = -aside, speed
+    segment = segment.replace(position=position, velocity=velocity)
+    assert bool(len(route_table(segment, LaneGraph(segment.road), 0).count)) is found
+
+
 def test_an_expert_that_goes_on_past_the_end_of_its_lane_is_not_left_there(tmp_path):
     road, x = lanes_that_end([(1, 0.0), (1, 0.0)]), np.arange(20.0, 155.0, 2.0)
     # It changes lanes twice; the routes among which one is chosen do so once.

@@ -304,6 +304,27 @@ def test_only_vehicles_that_have_stood_for_a_second_stand():
     assert found.tolist() == [True, False, False, True]
 
 
+def test_past_the_edge_of_the_map_vehicles_keep_their_velocity():
+    window = wosac_window(straight_road(num_agents=3))
+    end, position = window.road.lanes[0][-1, 0], window.position.copy()
+    position[..., 0] += (end - 40 - position[:, 10, 0])[:, None]
+    position[2, :, 0] += 70.0  # It is past the edge already.
+    window = window.replace(position=position)
+    found = wosac_rollouts(small(), window, PLAIN)
+    np.testing.assert_array_equal(found.x[:, 2], constant_velocity(window).x[:, 2])
+    x, y = found.x[:, :2] - window.origin[0], found.y[:, :2]
+    steps = np.diff(np.stack([x, y], -1), axis=2)
+    changes, gone = (
+        np.abs(np.diff(steps, axis=2)).max(-1),
+        x[..., :-2] > end + 4.0,
+    )  # A decision farther than the edge.
+    assert 0.3 < gone.mean() < 0.7
+    assert 10 * changes[gone].max() < 1e-2 < changes[~gone].max()
+    along = np.stack([np.cos(found.heading), np.sin(found.heading)], -1)[:, :2, :-2]
+    away = np.linalg.norm(steps[:, :, :-1], axis=-1, keepdims=True)
+    np.testing.assert_allclose((steps[:, :, :-1] - along * away)[gone], 0, atol=1e-3)
+
+
 def test_people_keep_their_velocity_but_for_pace_and_course_and_turn_as_they_did():
     window = wosac_window(straight_road(num_agents=3))
     rows, now, heading = np.array([0, 2]), window.current_step, window.heading.copy()

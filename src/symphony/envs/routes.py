@@ -39,6 +39,8 @@ STRIDE = 4  # the goal policy observes every STRIDE-th point of a route
 CHOICE_FEATURES = 5 * (POINTS // STRIDE)
 TURN_FEATURES = 2 + (POINTS - 2)
 """Where a route begins, and a turn at each of its points but the first and the last."""
+MOVING, WIDE = 2.0, 6.0
+"""Speed (m/s) above which a vehicle on no lane is on one as far away (m) as some cut a corner."""
 ONWARD = 200.0  # metres that routes reach beyond what the fastest agent can drive
 _FASTER, _FASTEST = 1.1, 45.0
 """Factor by which vehicles may be faster than the fastest of the log, and the m/s up to which they may."""
@@ -143,7 +145,10 @@ def _carried(
 def _starts(segment: RunSegment, graph: LaneGraph, agent: int, step: int) -> list[tuple[int, float]]:
     """Return lanes that an agent may be on, and metres along them: those of its height, where the map has any."""
     position, lanes = segment.position[agent, step], segment.road.lanes
-    starts = starting_lanes(graph, position[:2], float(segment.heading[agent, step]))
+    pose = position[:2], float(segment.heading[agent, step])
+    starts = starting_lanes(graph, *pose)
+    if not starts and np.linalg.norm(segment.velocity[agent, step]) > MOVING:
+        starts = starting_lanes(graph, *pose, tolerance=WIDE)
     if len(starts) < 2 or np.ptp(lanes.points[:, 2]) < LEVEL:
         return starts
     ground, kept = position[2] - 0.5 * segment.size[agent, 2], []

@@ -48,17 +48,20 @@ def lane_of(
     return _nearest(graph, near, turn, position[..., 0].size).reshape(position.shape[:-1])
 
 
-def starting_lanes(graph: LaneGraph, position: NDArray[Any], heading: float) -> list[tuple[int, float]]:
+def starting_lanes(
+    graph: LaneGraph, position: NDArray[Any], heading: float, *, tolerance: float = LATERAL
+) -> list[tuple[int, float]]:
     """Return every lane one vehicle may be on: inside a junction, where lanes overlap, usually several.
 
-    These are lanes at most :data:`MARGIN` metres farther away than the nearest one. Of a lane and its successor only
-    the one that the vehicle is alongside is kept. The lane that :func:`lane_of` names comes first, then by distance.
-    Pairs are (lane, metres from its start). Raises ValueError for a position or heading that is not finite.
+    These are lanes within a tolerance in metres, at most :data:`MARGIN` metres farther away than the nearest one. Of
+    a lane and its successor only the one that the vehicle is alongside is kept. The lane that :func:`lane_of` names
+    comes first, then by distance. Pairs are (lane, metres from its start). Raises ValueError for a position or a
+    heading that is not finite.
     """
     position = np.asarray(position, dtype=np.float64).reshape(1, 2)
     if not (np.isfinite(position).all() and np.isfinite(heading)):
         raise ValueError("a position or heading that is not finite")
-    near, turn = _compatible(graph, position, np.array([heading]), LATERAL)
+    near, turn = _compatible(graph, position, np.array([heading]), tolerance)
     if len(near.line) == 0:
         return []
     best = int(_nearest(graph, near, turn, 1)[0])

@@ -1,8 +1,9 @@
 """Rollouts as the Waymo Open Sim Agents Challenge asks for them: 32 futures of all agents, 8 s (or less) at 10 Hz.
 
 Nothing of the log after the current step is used: only agents that are valid then take part, and lights keep the
-latest state seen up to then. The learned agent drives all vehicles, however few it was trained to drive. Those that
-stand stay, and people walk on; driven vehicles see the latter at constant velocity.
+latest state seen up to then. The learned agent drives all vehicles, however few it was trained to drive, up to the
+edge of the map, past which they keep their velocity. Those that stand stay, and people walk on; driven vehicles see
+the latter at constant velocity.
 
 Legend: A agents, n of them valid at the current step, N vehicles among these, R rollouts, F future steps (80), U
 decisions and the first state.
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from symphony.agents import Agent
 from symphony.config import WosacSettings
@@ -28,11 +30,11 @@ from symphony.data.resample import wrap
 from symphony.data.segment import AgentType, RunSegment, SignalState, validate
 from symphony.data.sources.womd import scenario_to_segment
 from symphony.envs.routes import route_table
-from symphony.envs.scene import scene
+from symphony.envs.scene import MapEdge, beyond, map_edge, scene
 from symphony.errors import ConfigError, DataError
 from symphony.roadgraph import LaneGraph
 from symphony.rollouts.driving import simulation
-from symphony.rollouts.unroll import NotFiniteError
+from symphony.rollouts.unroll import NotFiniteError, Rollouts
 from symphony.rollouts.workers import shared
 from symphony.streams import Stream, fold_in, stream_of, uniform
 from symphony.wosac.records import parse_scenario, read_scenarios
@@ -128,14 +130,19 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings) -
     dt = DT if agent.spec is None else agent.spec.dt
     start = history_only(segment, dt, settings.future)
     is_vehicle = start.agent_type == AgentType.VEHICLE
-    vehicles, people = np.flatnonzero(is_vehicle & ~held[rows]), np.flatnonzero(~is_vehicle)
+    graph = LaneGraph(start.road)
+    edge = map_edge(graph) if len(graph.usable_lanes) else None
+    driven = is_vehicle & ~held[rows]
+    if edge is not None:
+        driven &= ~beyond(start.position[:, 0, :2], edge)
+    vehicles, people = np.flatnonzero(driven), np.flatnonzero(~is_vehicle)
     states = _extrapolated(segment, rows, settings.future)
     states[:, people] = walks(segment, rows[people], ROLLOUTS, settings.future, settings.seed)
     if len(vehicles):
         try:
             log = future_log(segment) if settings.logged_goals else None
-            driven = _driven(agent, start, vehicles, settings, log)
-            states[:, vehicles] = between_decisions(driven, dt, settings.future)
+            found = _driven(agent, start, vehicles, settings, graph, edge, log)
+            states[:, vehicles] = between_decisions(found, dt, settings.future)
         except NotFiniteError as error:
             raise error.named(segment.segment_id) from error
     return _rollouts(segment, rows, states)
@@ -263,12 +270,17 @@ def _extrapolated(segment: RunSegment, rows: NDArray[np.int64], future: int) -> 
 
 
 def _driven(
-    agent: Agent, start: RunSegment, vehicles: NDArray[np.int64], settings: WosacSettings, log: RunSegment | None
+    agent: Agent,
+    start: RunSegment,
+    vehicles: NDArray[np.int64],
+    settings: WosacSettings,
+    graph: LaneGraph,
+    edge: MapEdge | None,
+    log: RunSegment | None,
 ) -> Doubles:
     """Return [R, U, N, 3] x, y, heading of the vehicles; on the routes of the log, where there is one."""
-    graph = LaneGraph(start.road) if agent.routed else None
-    scenes = scene(start, vehicles.tolist(), graph)
-    if graph is not None and log is not None:
+    scenes = scene(start, vehicles.tolist(), graph if agent.routed else None, edge=edge)
+    if agent.routed and log is not None:
         # The first state is the same, so the routes are; which of them was taken is for the log to say.
         taken = [route_table(log, graph, int(row)).logged for row in vehicles]
         scenes.route_logged = torch.tensor([taken])
@@ -284,9 +296,18 @@ def _driven(
             settings.config(min(trees, ROLLOUTS - first), settings.seed * ROLLOUTS + first)
             for first in range(0, ROLLOUTS, trees)
         ]
-    found = [simulation(agent, scenes, plan).rollouts.state[0, ..., :3].cpu() for plan in plans]
+    found = [_gone_on(simulation(agent, scenes, plan).rollouts.cpu(), start.dt) for plan in plans]
     states = torch.cat(found).double().numpy()
     return np.repeat(states, ROLLOUTS // len(states), 0)
+
+
+def _gone_on(found: Rollouts, dt: float) -> Tensor:
+    """Return states [R, U, N, 3] of the one scene of rollouts: those that left the map keep their velocity."""
+    state, steps = found.state[0], torch.arange(found.state.shape[2])[:, None]
+    last = found.counted[0].sum(1, keepdim=True)  # [R, 1, N] the last decision at which each is present
+    x, y, heading, speed = state.take_along_dim(last.minimum(steps)[..., None], 1).unbind(-1)
+    away = speed * dt * (steps - last).clamp_min(0)
+    return torch.stack([x + away * heading.cos(), y + away * heading.sin(), heading], -1)
 
 
 def _rollouts(segment: RunSegment, rows: NDArray[np.int64], states: Doubles) -> SimulatedRollouts:
