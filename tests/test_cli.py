@@ -27,7 +27,7 @@ from helpers_store import fill
 from symphony import __version__
 from symphony.agents import Agent, discriminator_network, goal_network, policy_network
 from symphony.bench.measures import MEASURES
-from symphony.cli import GONE, main
+from symphony.cli import main
 from symphony.cli.data import Info
 from symphony.cli.planners import Rate
 from symphony.cli.recipe import Arguments
@@ -95,25 +95,8 @@ def test_what_users_type_changes_on_purpose_only(told: dict[str, str]) -> None:
     now = words(told)
     assert now == LINES, (
         f"gone: {sorted(set(LINES) - set(now))}, new: {sorted(set(now) - set(LINES))}; "
-        "say so in cli.GONE, and write the list anew: python tests/helpers_cli.py > tests/cli.txt"
+        "write the list anew: python tests/helpers_cli.py > tests/cli.txt"
     )
-
-
-@pytest.mark.parametrize("gone", GONE)
-def test_what_is_gone_is_told_with_what_takes_its_place(gone: str, capsys: Any) -> None:
-    command, _, option = gone.partition(" --")
-    name, _, value = option.partition(" ")
-    underscores = [f"--{name.replace('-', '_')}"] * bool(name)
-    joined = [f"--{option.replace(' ', '=')}" if value else f"--{name}=x"] * bool(name)
-    for typed in ([*gone.split(), "x"], [*command.split(), *underscores, value], [*command.split(), *joined]):
-        assert main(typed) == 2
-        assert f"`symphony {gone}` is gone: {GONE[gone]}" in capsys.readouterr().err
-    assert not any(line.startswith(gone) for line in LINES)
-
-
-def test_a_folder_may_be_called_as_what_is_gone(capsys: Any) -> None:
-    assert main(["plot", "curves", "tree", "--out", "a.png"]) == 1
-    assert "tree" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("args", "told"), [

@@ -26,31 +26,6 @@ from symphony.files import lock_file
 __all__ = ["main"]
 
 FAILED, USAGE, ALL_FAILED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 143  # how commands end, beside 0
-GONE = {
-    "wosac table": "`symphony table` shows the scores of runs that were evaluated with `--metrics wosac`",
-    "evaluate --wosac-config": "`symphony wosac evaluate` takes the year as --config",
-    "data info --routes": "`symphony plot routes` draws them",
-    "data info --per-segment": "the JSON always says which agents were chosen in each run segment",
-    "plot tree": "`symphony simulate RUN --data DIR --out SIM` and `symphony view SIM` show the branches of a search",
-    "plot rollouts": "`symphony evaluate RUN --data DIR --figure FILE` draws rollouts, and so does `symphony view`",
-    "plot curvature --data": "evaluate the runs first: `symphony evaluate RUN --data DIR`",
-    "data convert --append": "convert into another store, and put the two together by `symphony data merge`",
-    "evaluate --planner": "`symphony simulate RUN --planner NAME --data DIR --out SIM`, then `symphony planners SIM`",
-    "evaluate --planner-seconds": "`symphony simulate` has it, beside its `--planner`",
-    "planners --format": "the table is in Markdown, and `--json` writes its numbers",
-    "table --relations": "`python benchmarks/relations.py RUN ...` of a checkout prints them",
-    "table --paired": "`python benchmarks/relations.py RUN ... --paired METHOD` of a checkout prints them",
-    "table --each": "a method that was simulated in several ways has a row for each",
-    "table --format text": "`--format markdown`, as is the default, reads as text, too",
-    "table --format latex": "`--format json` has the numbers, and pandoc turns Markdown into LaTeX",
-    "table --columns": "`symphony evaluate RUN --data DIR --details` prints these numbers",
-    "simulate --metric": "`symphony evaluate --metric` computes them; they change no rollout",
-    "train --agent.persona": "agents have no driving styles to be told",
-    **dict.fromkeys(("evaluate --persona", "simulate --persona"), "agents have no driving styles to be told"),
-    "wosac score --features": "`symphony.wosac.scorer.compute_features` gives them in Python",
-    "simulate --agents": "the agent is named without an option: `symphony simulate RUN --data DIR --out SIM`",
-}
-"""Removed commands and options, and what replaces them."""
 POSITIONAL = get_args(tyro.conf.Positional[int])[1]
 
 DESCRIPTION = """Realistic and diverse traffic agents learned from logged driving.
@@ -82,7 +57,6 @@ def main(args: Sequence[str] | None = None) -> int:
     if args == ["--version"]:
         return guarded(lambda: print(f"symphony {__version__}"))  # noqa: T201
     try:
-        _refuse_gone(args)
         chosen = app.cli(
             prog="symphony",
             description=DESCRIPTION,
@@ -108,18 +82,6 @@ def main(args: Sequence[str] | None = None) -> int:
             chosen()
 
     return guarded(run)
-
-
-def _refuse_gone(args: Sequence[str]) -> None:
-    """Raise ConfigError for commands and options that are gone, however they are spelt."""
-    pairs = (word.replace("_", "-").split("=", 1) if word.startswith("--") else [word] for word in args)
-    words = [part for pair in pairs for part in pair]
-    for gone, instead in GONE.items():
-        command = gone.partition(" --")[0].split()
-        option, begin = gone.split()[len(command) :], len(command)
-        rest = (words[k : k + len(option)] for k in range(begin, len(words) + 1))
-        if words[:begin] == command and option in rest:
-            raise errors.ConfigError(f"`symphony {gone}` is gone: {instead}")
 
 
 def settle() -> None:
