@@ -459,9 +459,8 @@ def test_an_expert_that_goes_on_past_the_end_of_its_lane_is_not_left_there(tmp_p
     kept.save("one", expert)
     (other,) = kept.load("one").routes
     assert np.array_equal(other.followed(table.logged), table.followed(table.logged))
-    assert expert.nbytes > dataclasses.replace(expert, routes=()).nbytes + table.points.nbytes + sum(
-        line.nbytes for line in table.carried.values()
-    )
+    carried = sum(line.nbytes for line in table.carried.values())
+    assert expert.nbytes > dataclasses.replace(expert, routes=()).nbytes + table.points.nbytes + carried > carried > 0
 
 
 @settings(max_examples=2)
