@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import gc
+import importlib.util
 import multiprocessing
 import os
+import shutil
 import signal
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +20,24 @@ from hypothesis import settings
 
 from helpers_processes import serve_from_here
 from helpers_skips import LIMITS, by_kind, grown
+from symphony import allocator
 from symphony import parallel as engine
 
-# There is next to no garbage while tests are imported; to look for it would be a fifth of that work.
+MEMORY = "/dev/shm"  # noqa: S108 - pytest makes a folder of its own there
+
+# There is next to no garbage while tests are imported; to look for it would be a fifth of that work. Nor is there
+# much among so few new objects as Python looks at by default.
 gc.disable()
+gc.set_threshold(20_000, 10, 10)
+
+# TensorDict looks for pandas after every network, which takes long where there is none.
+find = importlib.util.find_spec
+if find("pandas") is None:
+    importlib.util.find_spec = lambda name, package=None: None if name == "pandas" else find(name, package)
+
+# Thousands of small files are made and removed in memory, where there is room for them.
+if os.path.isdir(MEMORY) and shutil.disk_usage(MEMORY).free > 8 << 30:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", MEMORY)
 
 # A busy machine must not fail a test; other examples are tried each time.
 settings.register_profile("symphony", deadline=None, max_examples=20)
@@ -42,6 +59,10 @@ def pytest_collection_finish() -> None:
     """Nothing that was imported or collected is garbage: it is not to be looked at again and again."""
     gc.freeze()
     gc.enable()
+    allocator.tune()  # this process is ours
+    if "tyro" in sys.modules:  # which would read the source of commands each time, asked for by the hundred
+        source = sys.modules["tyro._docstrings"]._ClassTokenization
+        source.make = cache(source.make)
     serve_from_here()
 
 

@@ -348,14 +348,10 @@ class Remembers(Policy):
 def test_a_compiled_search_is_the_search_and_compiled_once():
     torch.compiler.reset()
     graphs = []
-
-    def backend(graph, _):
-        graphs.append(graph)
-        return graph.forward
-
+    kept = {"backend": lambda graph, _: graphs.append(graph) or graph.forward}
     for policy, programs in ((Policy(), 1), (Remembers(), 2)):
         graphs.clear()
-        plain, compiled = make(policy=policy), make(policy=policy, compile_step={"backend": backend})
+        plain, compiled = make(policy=policy), make(policy=policy, compile_step=kept)
         for collector in (plain, compiled):
             collector.set_seed(3)
         for _ in range(2):

@@ -117,30 +117,28 @@ def test_a_device_finds_the_same(monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
-@torch.no_grad()
 def test_an_environment_is_compiled_where_it_is_and_its_copies_are_not():
+    """Nor is the gradient another, where what is driven depends on the start."""
     torch.compiler.reset()
     scenes = collate([scene(straight_road(), [0, 1])])
-    env = DrivingEnv(scenes, Displacement(), ObservationConfig.nothing(), seed=0)
-    plain = env.rollout(4)
+    env = DrivingEnv(scenes, Displacement(), ObservationConfig.nothing())
     calls = []
+    kept = {"backend": lambda graph, _: calls.append(graph) or graph.forward, "fullgraph": True}
 
-    def backend(graph: torch.fx.GraphModule, _: object) -> Any:
-        calls.append(graph)
-        return graph.forward
-
-    env.compile(backend=backend, fullgraph=True)
-    # Again is not twice; and a batch without dimensions, as rollouts have it, compiles, too.
-    env.compile(backend=backend, fullgraph=True)
-    env.set_seed(0)
-    torch.manual_seed(0)
-    compiled = env.rollout(4)
-    assert len(calls) == 1
-    assert plain.shape == compiled.shape
-    copy = pickle.loads(pickle.dumps(env))  # noqa: S301 - just pickled
-    for tried in (env, copy):
+    def driven(env: DrivingEnv) -> Any:
         torch.manual_seed(0)
-        tried.set_seed(0)
-        assert_close(tried.rollout(4), compiled, rtol=0, atol=1e-5)
-    assert len(calls) == 1
+        env.set_seed(0)
+        start = (begin := env.reset()).set(keys.STATE, begin[keys.STATE].requires_grad_())
+        found = env.rollout(4, auto_reset=False, tensordict=start)
+        (slope,) = torch.autograd.grad(found["next", *keys.STATE].sum(), start[keys.STATE])
+        return found.set("slope", slope.expand(4, 2, 4)).detach()
+
+    plain = driven(env)
+    env.compile(**kept)
+    # Again is not twice; and a batch without dimensions, as rollouts have it, compiles, too.
+    env.compile(**kept)
+    copy = pickle.loads(pickle.dumps(env))  # noqa: S301 - just pickled
+    for tried in (env, env, copy):
+        assert_close(driven(tried), plain, rtol=0, atol=1e-5)
+        assert len(calls) == 1
     assert copy._step.__func__ is DrivingEnv._step

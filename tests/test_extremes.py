@@ -25,7 +25,6 @@ from symphony.agents import Agent
 from symphony.config import AgentConfig, EvaluateConfig, MGAILConfig, ValidationConfig
 from symphony.data import segment as schema
 from symphony.data.store import SegmentStore
-from symphony.data.store_writer import StoreWriter
 from symphony.errors import SymphonyError
 from symphony.evaluation import evaluate
 from symphony.rollouts.unroll import NotFiniteError
@@ -214,12 +213,8 @@ SEARCHES = (("none", "best"), ("tree", "systematic"), ("backtrack", "best"))
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> SegmentStore:
-    path = tmp_path_factory.mktemp("data") / "store"
-    with StoreWriter(path) as writer:
-        writer.append(straight_road(4, seed=0, steps=LENGTHS[0]))
-        writer.append(crossing(4, seed=1, steps=LENGTHS[1]))
-        writer.append(crossing(4, seed=2, steps=LENGTHS[2]))
-    return SegmentStore(path)
+    crossings = [crossing(4, seed=k, steps=LENGTHS[k]) for k in (1, 2)]
+    return fill(tmp_path_factory.mktemp("data") / "store", [straight_road(4, steps=LENGTHS[0]), *crossings])
 
 
 class Spoiled(TensorDictModuleBase):

@@ -14,13 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from symphony.data.selection import Context, relations
-from symphony.metrics import (
-    CollisionKind,
-    CollisionKinds,
-    RolloutMetrics,
-    curvature_histogram,
-    jensen_shannon,
-)
+from symphony.metrics import CollisionKind, CollisionKinds, RolloutMetrics, curvature_histogram, jensen_shannon
 from symphony.metrics.order import REACH, order_statistics, passing_gap
 from test_selection import BY_CONTEXT, CASES, scene
 

@@ -275,16 +275,13 @@ def test_bad_calls_are_refused(env):
 
 
 @pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0")
-def test_compiled_steps_give_the_same_loss_and_gradient(env):
+def test_compiled_steps_give_the_same_loss_and_gradient():
     torch.compiler.reset()
     programs = []
-
-    def backend(graph, _):
-        programs.append(graph)
-        return graph.forward
-
-    td, how = planned(env), {"detach_keys": SEEN, "truncate": 2}
-    plain, compiled = value_and_gradient(make(env, **how), td), make(env, **how, compile_step={"backend": backend})
+    kept = {"backend": lambda graph, _: programs.append(graph) or graph.forward}
+    td, how = starts(Walk(2), 5, branches=1)[:, 0], {"detach_keys": [X], "truncate": 2}
+    td[VALID] = torch.ones(5, 2, dtype=torch.bool)
+    plain, compiled = value_and_gradient(walkers(2, **how), td), walkers(2, **how, compile_step=kept)
     for _ in range(2):
         assert_same(value_and_gradient(compiled, td), plain)
     assert len(programs) == 2  # of states with and without a gradient

@@ -13,13 +13,13 @@ import torch
 
 from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
+from helpers_store import fill
 from symphony.agents import choice as pretrained
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import checkpoints, parts_of
 from symphony.agents.choice import choose
 from symphony.cli import main
 from symphony.config import AgentSpec, EvaluateConfig, MGAILConfig, ValidationConfig, to_json
-from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError
 from symphony.recipes import train
 
@@ -42,10 +42,7 @@ make_pretrained = load_script("make_pretrained")
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "town" / "train"
-    with StoreWriter(path) as writer:
-        writer.append(straight_road(4, steps=5))
-        writer.append(crossing(4, seed=1, steps=5))
-    return path
+    return fill(path, [straight_road(4, steps=5), crossing(4, seed=1, steps=5)]).path
 
 
 @pytest.fixture(scope="module")

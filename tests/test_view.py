@@ -139,10 +139,7 @@ def test_chosen_segments_pictures_and_animations(tmp_path: Path, capsys: pytest.
         assert main(["view", sim, "--out", str(tmp_path / name)]) == 0
         with Image.open(tmp_path / name) as image:
             assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 20)
-    wrong = {
-        ("--out", str(tmp_path / "a.doc")): ".mp4",
-        ("--segments", "nothing"): "no rollouts of this segment",
-    }
+    wrong = {("--out", str(tmp_path / "a.doc")): ".mp4", ("--segments", "nothing"): "no rollouts of this segment"}
     for words, why in wrong.items():
         assert main(["view", sim, *words]) == 1
         assert why in capsys.readouterr().err
