@@ -251,7 +251,7 @@ Shard = pb.SimAgentsChallengeSubmission
 
 def archive(shards):
     file = io.BytesIO()
-    with tarfile.open(fileobj=file, mode="w:gz") as packed:
+    with tarfile.open(fileobj=file, mode="w:gz", compresslevel=1) as packed:
         for name, content in shards:  # names may come twice
             member = tarfile.TarInfo(name)
             member.size = len(content)
