@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from torchrl.envs.utils import step_mdp
 
 from helpers_agents import make_agent
-from helpers_segments import LANE_WIDTH, crossing, hide, make_road, make_segment, straight_road
+from helpers_segments import LANE_WIDTH, crossing, hide, make_road, make_segment
 from helpers_store import brief, fill
 from symphony import keys
 from symphony.agents import load_agent
@@ -296,17 +296,3 @@ def test_a_goal_is_a_route_over_its_lane_or_past_its_point():
         asked(f"{name[0]}=lane:108", f"{name[0]}=lane:110")
     with pytest.raises(ConfigError, match="planner drives"):
         asked(f"{name[0]}=lane:108", planned=True)
-
-
-def test_a_cold_draw_is_the_likeliest_action():
-    segment = straight_road(4, steps=9)
-    scenes, how = scene(segment, 3, LaneGraph(segment.road)), {"search": "none", "logged_goals": True}
-    plain, same, cold, warm = (
-        simulation(tiny(), scenes, EvaluateConfig(rollouts=3, action_temperature=t, **how)).rollouts.state
-        for t in (1.0, 1.0 + 1e-9, 1e-7, 3.0)
-    )
-    assert torch.equal(same, plain)
-    assert (cold == cold[:, :1]).all()
-    assert not (warm == warm[:, :1]).all()
-    with pytest.raises(ConfigError, match="no discrete actions"):
-        simulation(load_agent("constant_velocity"), scenes, EvaluateConfig(action_temperature=0.5))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -445,7 +444,6 @@ def test_who_drives_beside_its_lane_is_on_it(aside, speed, found):
 
 def test_an_expert_that_goes_on_past_the_end_of_its_lane_is_not_left_there(tmp_path):
     road, x = lanes_that_end([(1, 0.0), (1, 0.0)]), np.arange(20.0, 155.0, 2.0)
-    # It changes lanes twice; the routes among which one is chosen do so once.
     y = LANE_WIDTH * (((x - 30) / 25).clip(0, 1) + ((x - 105) / 30).clip(0, 1))
     path, heading = np.stack([x, y], -1), np.arctan2(np.gradient(y), np.gradient(x))
     velocity = 10 * np.stack([np.cos(heading), np.sin(heading)], -1)
@@ -459,8 +457,6 @@ def test_an_expert_that_goes_on_past_the_end_of_its_lane_is_not_left_there(tmp_p
     kept.save("one", expert)
     (other,) = kept.load("one").routes
     assert np.array_equal(other.followed(table.logged), table.followed(table.logged))
-    carried = sum(line.nbytes for line in table.carried.values())
-    assert expert.nbytes > dataclasses.replace(expert, routes=()).nbytes + table.points.nbytes + carried > carried > 0
 
 
 @settings(max_examples=2)

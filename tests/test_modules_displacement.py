@@ -10,15 +10,18 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torch import Tensor
 
+from symphony import keys
 from symphony.config import AgentConfig, AgentSpec
 from symphony.envs import Displacement
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES
 from symphony.errors import ConfigError
 from symphony.geometry.frames import wrap
-from symphony.keys import OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, STATE, VALID
+from symphony.keys import NOISE, OBJECTS, OBJECTS_MASK, OWN, POINTS, POINTS_MASK, STATE, STEP, VALID
 from symphony.modules import BoundedDisplacement, DisplacementHistogram, ElementGroup, displacement_policy
 from symphony.modules.bounded import INSIDE, LEAST, SMOOTH, displaced, inverse_cdf, shares
+from symphony.modules.policy import SeededNoise
 from symphony.streams import Stream, fold_in, stream_of, uniform
 
 MASK = 2**64 - 1
@@ -37,6 +40,26 @@ def folded(stream: int, index: int) -> int:
     return splitmix((stream + (index + 1) * 0x9E3779B97F4A7C15) & MASK)
 
 
+@pytest.mark.parametrize("numbers", [0, 2])
+def test_the_pace_of_an_agent_lasts_for_a_rollout_and_draws_stay_uniform(numbers):
+    steps, share = 40, 0.3
+    start = TensorDict({keys.STREAM: torch.arange(400)[:, None]}, [400])
+    start.set(VALID, torch.ones(400, 2, dtype=torch.bool))
+
+    def drawn(pace: float) -> Tensor:
+        noise = SeededNoise(3, numbers, pace)
+        each = [noise(start.set(STEP, torch.full((400, 1), t))).get(NOISE) for t in range(steps)]
+        return torch.stack(each, -1).reshape(400, 2, -1, steps)
+
+    alone, lasting = drawn(0.0), drawn(share)
+    assert torch.equal(lasting[:, :, 1:], alone[:, :, 1:])
+    level = torch.linspace(0.1, 0.9, 9)
+    assert (lasting[:, :, 0].flatten().quantile(level) - level).abs().max() < 0.03
+    mean = torch.special.ndtri(lasting[:, :, 0].double()).mean(-1)
+    assert float(mean.var()) == pytest.approx(share + (1 - share) / steps, abs=0.06)
+    assert abs(float((mean[:, 0] * mean[:, 1]).mean())) < 0.05
+
+
 def test_the_hash_is_splitmix64():
     # First output of the reference generator for state 0.
     assert folded(0, 0) == int(fold_in(torch.tensor(0), 0)) & MASK == 0xE220A8397B1DCDAF
@@ -51,7 +74,7 @@ def test_tensor_arithmetic_equals_unbounded_integers(seed, stream, step):
 
 def test_streams_keep_the_numbers_that_rollouts_were_made_with_in_every_process():
     first = 1 << 40
-    kept = {"GOALS": 0, "PRUNING": 1, "PLANNERS": 3, "WALKS": 5, "ENTRIES": 6, "BACKTRACKING": first}
+    kept = {"GOALS": 0, "PRUNING": 1, "PLANNERS": 3, "WALKS": 5, "ENTRIES": 6, "PACE": 7, "BACKTRACKING": first}
     assert {stream.name: stream - first for stream in Stream} == kept
     assert stream_of("a segment") == STREAM != stream_of("a segment ")
     assert -(2**63) <= STREAM < 2**63
@@ -62,8 +85,7 @@ def test_a_draw_inverts_the_cumulative_distribution():
     upper = logits.softmax(-1).cumsum(-1)
     lower = upper - logits.softmax(-1)
     for share in (0.01, 0.5, 0.99):
-        noise = lower + share * (upper - lower)
-        drawn = inverse_cdf(logits[:, None].expand(50, 9, 9), noise)
+        drawn = inverse_cdf(logits[:, None].expand(50, 9, 9), lower + share * (upper - lower))
         assert torch.equal(drawn, torch.arange(9).expand(50, 9))
 
 

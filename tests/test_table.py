@@ -238,7 +238,7 @@ def test_bars_are_shares_of_all_visits(tmp_path_factory: Any, counts: list[int],
 CHANGES: dict[str, Any] = {
     "rollouts": 8, "search": "backtrack", "score": "rule", "trees": 2, "branches": 8,
     "rule": "systematic", "logged_goals": True, "seed": 1, "duration": 20, "interactive": 8, "prune_every": 2,
-    "temperature": 0.6, "threshold": 2.0, "goals": "branch", "metric": ["my.metrics:jerk"], "action_temperature": 0.5,
+    "temperature": 0.6, "threshold": 2.0, "goals": "branch", "metric": ["my.metrics:jerk"], "pace": 0.5,
     "radius": 50.0, "open_traffic": True, "others": "idm",
 }  # fmt: skip
 TREE = {"search": "tree", "trees": 1, "branches": 16, "rule": "best"}

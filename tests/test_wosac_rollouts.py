@@ -312,8 +312,8 @@ def test_past_the_edge_of_the_map_vehicles_keep_their_velocity():
     window = window.replace(position=position)
     found = wosac_rollouts(small(), window, PLAIN)
     np.testing.assert_array_equal(found.x[:, 2], constant_velocity(window).x[:, 2])
-    x, y = found.x[:, :2] - window.origin[0], found.y[:, :2]
-    steps = np.diff(np.stack([x, y], -1), axis=2)
+    x = found.x[:, :2] - window.origin[0]
+    steps = np.diff(np.stack([x, found.y[:, :2]], -1), axis=2)
     changes, gone = (
         np.abs(np.diff(steps, axis=2)).max(-1),
         x[..., :-2] > end + 4.0,
@@ -395,7 +395,7 @@ def test_evaluation(tmp_path):
     found = record("--search", "none", "--horizon", "1")
     assert (found["objects"], found["hertz"]) == (6, [5.0])
     assert list(found["agents"]) == ["playback", "constant_velocity", "idm", "random", AGENT]
-    assert found["how"] == {"search": "none", "seed": 0, "logged_goals": False, "horizon": 1.0}
+    assert found["how"] == {"search": "none", "seed": 0, "logged_goals": False, "horizon": 1.0, "pace": 0.25}
     for numbers in found["agents"].values():
         each = [one["metametric"] for one in numbers["segments"].values()]
         assert numbers["metametric"] == pytest.approx(np.mean(each))

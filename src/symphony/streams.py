@@ -22,6 +22,7 @@ class Stream(IntEnum):
     PLANNERS = (1 << 40) + 3  # seeds of the planners of egos
     ENTRIES = (1 << 40) + 6  # vehicles that enter past the log
     WALKS = (1 << 40) + 5  # walks of people that are not driven
+    PACE = (1 << 40) + 7  # how fast an agent is in a whole rollout
     BACKTRACKING = 1 << 41  # lines that go back, each of its tries: this and how many there were
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from tyro.conf import Fixed, Suppress
 
 from symphony.config.agent import SearchConfig
-from symphony.config.checks import Bounds, Count, Names, Natural, NotNegative, Positive, Settings
+from symphony.config.checks import Bounds, Count, Names, Natural, NotNegative, Settings
 from symphony.errors import ConfigError
 
 Search = Literal["agent", "none", "tree", "backtrack"]
@@ -70,8 +70,9 @@ class SimulationConfig(Settings):
     #: Sharing of goals: by all branches of a `tree` (the paper), or not at all, as each `branch` draws its own;
     #: `agent`: as the agent was trained.
     goals: Goals = "agent"
-    #: Temperature of the draw of discrete actions: below 1 likely ones become likelier, above 1 the rare ones.
-    action_temperature: Positive = 1.0
+    #: Share of the variance of an agent's draws that is drawn once for a whole rollout, as drivers differ in pace; 0:
+    #: every step draws anew.
+    pace: Annotated[float, Bounds(0, 1)] = 0.0
     seed: int = 0  # Seed of everything that is drawn at random in the rollouts.
     device: str = "cpu"  # Device that simulates: `cpu`, `cuda` or `cuda:N`.
     #: Processes that share the batches of run segments, with one thread each (changes speed, not results).
@@ -173,6 +174,9 @@ class WosacSettings(SimulationConfig):
     #: unreal; `rule`: collisions, also those within half a second if all keep speed and course, and time off the
     #: road.
     score: WosacScore = "agent"
+    #: Share of the variance of an agent's draws that is drawn once for a whole rollout, as drivers differ in pace; 0:
+    #: every step draws anew. That of logged drivers is .17 (simulated towns) and .32 (NGSIM).
+    pace: Annotated[float, Bounds(0, 1)] = 0.25
     #: Give agents the routes of the log instead of sampled ones; for the score only, since it tells them the future.
     logged_goals: bool = False
     #: Seconds that are simulated and scored: the challenge's 8, or less for logs that are shorter. Scores of another

@@ -109,7 +109,7 @@ def evaluate(
     size = segments_together(agent, config, dataset.interactive)
     config = settled(config, dataset, -(-len(dataset) // size))
     # Baselines always do the same, and have no discriminator to search by.
-    alone: Any = {"rollouts": 1, "trees": 1, "search": "none", "action_temperature": 1.0, "compile": "no"}
+    alone: Any = {"rollouts": 1, "trees": 1, "search": "none", "pace": 0.0, "compile": "no"}
     once = dataclasses.replace(config, **alone)
     acting: int | Literal["all"] = "all" if config.interactive == "all" else dataset.interactive
     found = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,7 +24,7 @@ from symphony import keys
 from symphony.geometry.nearest import on_host
 from symphony.modules.bounded import BoundedDisplacement, DisplacementHistogram, inverse_cdf, positive
 from symphony.modules.encoder import ElementGroup, EncoderClass, SceneEncoder, SceneNetwork, mlp, scene_module
-from symphony.streams import fold_in, uniform
+from symphony.streams import Stream, fold_in, uniform
 
 NO_ROUTE = -1e4
 """Logit of a route that does not exist; finite, so that an agent without any still has a distribution."""
@@ -194,15 +195,17 @@ class SeededNoise(TensorDictModuleBase):
     """Gives every agent the random number that decides its next action.
 
     It depends only on the seed, the rollout's identity, the step and the agent's place (never on the batch). There
-    are ``numbers`` of them per agent; 0 stands for a single one without a dimension of its own.
+    are ``numbers`` of them per agent; 0 stands for a single one without a dimension of its own. Each is uniform; with
+    a ``pace`` that share of the variance of the first one, as a normal score, is the same at all steps of a rollout,
+    so that an agent is fast or slow throughout.
     """
 
     in_keys = [keys.STREAM, keys.STEP, keys.VALID]  # noqa: RUF012 - the type TensorDictModuleBase declares
     out_keys = [keys.NOISE]  # noqa: RUF012
 
-    def __init__(self, seed: int, numbers: int = 0) -> None:
+    def __init__(self, seed: int, numbers: int = 0, pace: float = 0.0) -> None:
         super().__init__()
-        self.seed, self.numbers = seed, numbers
+        self.seed, self.numbers, self.pace = seed, numbers, pace
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write random numbers [..., N] or [..., N, numbers] in (0, 1)."""
@@ -212,7 +215,14 @@ class SeededNoise(TensorDictModuleBase):
         if self.numbers:
             stream = fold_in(stream[..., None], torch.arange(self.numbers, device=stream.device))
             step = step[..., None]
-        return tensordict.set(keys.NOISE, uniform(self.seed, stream, step))
+        found = uniform(self.seed, stream, step)
+        if self.pace:
+            lasting = torch.special.ndtri(uniform(self.seed, fold_in(stream, Stream.PACE), 0))
+            score = math.sqrt(self.pace) * lasting + math.sqrt(1 - self.pace) * torch.special.ndtri(found)
+            paced = torch.special.ndtr(score).clamp(2.0**-24, 1 - 2.0**-24)
+            # The first number decides the acceleration before the steering, or how far a displacement leads ahead.
+            found = torch.cat([paced[..., :1], found[..., 1:]], -1) if self.numbers else paced
+        return tensordict.set(keys.NOISE, found)
 
 
 class NoiseSampler(ProbabilisticTensorDictModule):

@@ -9,26 +9,14 @@ import shapely
 import torch
 from jaxtyping import Int
 from numpy.typing import NDArray
-from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from symphony import keys
 from symphony.data.segment import RunSegment
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
-from symphony.modules import inverse_cdf
 
 REACH = 3.0
 """Metres from a route, on average, within which it goes to the end of a lane or past a point."""
-
-
-def tempered(temperature: float) -> TensorDictModule:
-    """Build a module that draws actions [..., N] again from logits divided by a temperature, by the same numbers."""
-
-    def draw(logits: Tensor, noise: Tensor) -> Tensor:
-        return inverse_cdf(logits / temperature, noise)
-
-    return TensorDictModule(draw, [keys.LOGITS, keys.NOISE], [keys.ACTION])
 
 
 def given_goals(

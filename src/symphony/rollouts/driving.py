@@ -26,7 +26,6 @@ from symphony.metrics import collisions
 from symphony.modules import SeededNoise
 from symphony.planners.driver import EgoPlanners, EgoPolicy, PlannedEnv
 from symphony.rollouts.background import CarFollower, constant_speed
-from symphony.rollouts.control import tempered
 from symphony.rollouts.search import COMPILER, going_back, no_value, pruning_rule, search
 from symphony.rollouts.unroll import (
     NaNGuard,
@@ -137,7 +136,7 @@ def simulation(
     # The rollouts [B, trees, taken] that count, of all branches.
     chosen, tree = torch.arange(taken, device=env.device).expand(len(scenes), trees, -1), None
     if not searches and not compiled:
-        noise = SeededNoise(config.seed, env.dynamics.numbers)
+        noise = SeededNoise(config.seed, env.dynamics.numbers, config.pace)
         found = simulate(env, TensorDictSequential(noise, actor), start)
         steps, ends, goal = start.numel() * env.decisions, start, start.get(keys.GOAL)
     else:
@@ -151,6 +150,7 @@ def simulation(
                 scorer,
                 start,
                 seed=config.seed,
+                pace=config.pace,
                 rule=rule,
                 prune_every=settings.prune_every,
                 score=settings.score,
@@ -200,11 +200,7 @@ def simulate_batch(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, **h
 
 
 def _acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig) -> TensorDictModuleBase:
-    """Return a policy with a configuration's changes to its draws and the rule that drives background agents."""
-    if config.action_temperature != 1.0:
-        if keys.LOGITS not in policy.out_keys or not env.dynamics.discrete:
-            raise ConfigError("action-temperature has no effect on this agent: it draws no discrete actions")
-        policy = TensorDictSequential(policy, tempered(config.action_temperature))
+    """Return a policy, followed by the rule that drives background agents."""
     return TensorDictSequential(policy, RULES[config.others](env)) if config.others in RULES else policy
 
 

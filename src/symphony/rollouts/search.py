@@ -189,6 +189,7 @@ def search(
     seed: int,
     rule: PruningRule | Backtrack,
     prune_every: int,
+    pace: float = 0.0,
     score: Score = "discriminator",
     planned: int = 0,
     also: Sequence[keys.Key] = (),
@@ -206,7 +207,7 @@ def search(
     try:
         return beam_search(
             env,
-            TensorDictSequential(SeededNoise(seed, env.dynamics.numbers), policy),
+            TensorDictSequential(SeededNoise(seed, env.dynamics.numbers, pace), policy),
             realism_score(env, discriminator, score=score, planned=planned) if value is None else no_score,
             start,
             value=None if value is no_value else value,
