@@ -28,13 +28,13 @@ def mgail_ts(config: TrainConfig, processes: Processes) -> Trainer:
 
     # Environment and collector: the discriminator prunes branches of every segment.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=processes.device)
+    rows, rule = config.rows(len(data)), pruning_rule(config.search)
     collector = BeamSearchCollector(
-        with_rows(env, [config.rows(len(data))]),
+        with_rows(env, [rows]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, discriminator),
-        rule=pruning_rule(config.search),
         prepare=branched_streams,
-        **collector_settings(config.search, env, seed, data, config.rows(len(data))),
+        **collector_settings(config.search, env, seed, data, rows, rule),
     )
     replay = SearchReplay(collector, env, data, config.search.updates, config.search.states, config.segments)
 

@@ -20,9 +20,10 @@ from symphony.training import Processes, Trainer
 
 def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
     """A configuration of the smallest networks and batches."""
+    rule: Any = "systematic" if "ts" in str(method) else "replace"
     base = TrainConfig(
         method=method, data=store, out=out, steps=4, agent=AgentConfig(num_points=12, hidden=8), segments=2,
-        states=16, search=SearchConfig(branches=2, prune_every=2, updates=2, states=8, test_branches=2),
+        states=16, search=SearchConfig(branches=2, prune_every=2, updates=2, states=8, test_branches=2, rule=rule),
         discriminator=DiscriminatorConfig(hidden=8), checkpoint_every=2, log_every=1, wandb="disabled",
     )  # fmt: skip
     return replace(base, **changes)

@@ -156,11 +156,11 @@ def collector_settings(
     seed: int,
     data: SceneDataset,
     segments: int,
-    rule: PruningRule | None = None,
+    rule: PruningRule,
 ) -> dict[str, Any]:
-    """Return settings that a collector of driving needs beside environment, policy and scores: whole trees of
-    ``segments`` run segments at a time, random numbers that depend on nothing but seed, segment, branch and step.
-    ``rule`` prunes, by default the configured one.
+    """Return settings that a collector of driving needs beside environment, policy and scores: trees of ``segments``
+    run segments at a time, which a ``rule`` prunes, and random numbers that depend on nothing but seed, segment,
+    branch and step.
     """
     return {
         "branches": config.branches,
@@ -168,7 +168,8 @@ def collector_settings(
         "keep_tree": True,
         "prune_every": config.prune_every,
         "rule_noise": pruning_noise(seed),
-        **_settings(env, pruning_rule(config) if rule is None else rule),
+        "rule": rule,
+        **_settings(env, rule),
         "frames_per_batch": segments * config.branches * data.decisions,
         "total_frames": -1,
         **compiled(data),
