@@ -46,7 +46,7 @@ class Backtrack:
     """
 
     threshold: float
-    back: tuple[int, ...] = (3, 5, 10, 0, 0)
+    back: tuple[int, ...] = (3, 5, 10, *[0] * 9)
     cap: float = 6.0
     renew: Renew | None = None
     width: int | None = None
