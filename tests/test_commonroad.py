@@ -298,7 +298,6 @@ def test_the_ego_of_a_planning_problem_is_on_its_way_to_the_goal(path, tmp_path,
     (segment,) = problems_of(path, *forked(), driver(7, x=30.0), problem(goal))
     assert (segment.segment_id, segment.group) == ("ZAM_Made-1_1_T-1_problem100", "ZAM_Made-1_1_T-1")
     assert (segment.agent_id.tolist(), segment.ego, segment.num_steps) == ([100, 7], 0, 31)
-    # It has no log but its first state.
     assert segment.valid[0].tolist() == [True] + [False] * 30
     assert segment.velocity[0, 0].tolist() == [8, 0]
     np.testing.assert_allclose(segment.size[0], [4.508, 1.61, 0])
@@ -306,6 +305,7 @@ def test_the_ego_of_a_planning_problem_is_on_its_way_to_the_goal(path, tmp_path,
     np.testing.assert_allclose(segment.goal + segment.origin[:2], place, atol=0.2)
     store = fill(tmp_path / "store", [segment])
     assert (store[0].goal, store.tags(0)) == (segment.goal, {})
+    assert content_hash(store[0]) == store.content(0) != content_hash(segment.replace(goal=None))
     made = scene(store[0], [0], LaneGraph(segment.road))
     end = made.whole_route(0, 0, int(made.route_logged[0, 0]))[-1].numpy() + segment.origin[:2]
     np.testing.assert_allclose(end, {11: (150, 0), 12: (90, 40)}[lane], atol=0.1)

@@ -201,8 +201,8 @@ class RunSegment:
     #: Not part of the content hash.
     odd: Mapping[str, str] = field(default_factory=dict, metadata={"hashed": False})
     #: x, y where the ego is to come past, which its log does not show (a planning problem of CommonRoad). A store
-    #: keeps it as a tag. Not part of the content hash.
-    goal: list[float] | None = field(default=None, metadata={"hashed": False})
+    #: keeps it as a tag. Part of the content hash where there is one.
+    goal: list[float] | None = field(default=None, metadata={"hashed": "given"})
     #: steps of the log where the segment goes on past it (:mod:`symphony.rollouts.onward`); 0 where all are. Not part
     #: of the content hash, and never in a store.
     logged: int = field(default=0, metadata={"hashed": False})
@@ -237,7 +237,8 @@ def content_hash(segment: RunSegment | RoadMap) -> str:
 def _feed(digest: Any, value: Any) -> None:
     if dataclasses.is_dataclass(value):
         for item in dataclasses.fields(value):
-            if item.metadata.get("hashed", True):
+            hashed = item.metadata.get("hashed", True)
+            if hashed is True or (hashed and getattr(value, item.name) is not None):
                 digest.update(item.name.encode() + b"=")
                 _feed(digest, getattr(value, item.name))
     elif isinstance(value, np.ndarray):

@@ -325,7 +325,7 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
                 flat = lines.offsets.ndim == 1 and len(lines.offsets) > 0 and lines.points.ndim == 2
                 if not flat or lines.offsets.dtype != np.int64:
                     raise DataError("must be points [P, 3] and int64 offsets", field=name)
-            elif item.name not in held and item.metadata.get("hashed", True):
+            elif item.name not in held and item.metadata.get("hashed", True) is True:
                 held[item.name] = arrays[name]
         return kind(**held)
 
