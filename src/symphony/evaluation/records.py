@@ -156,6 +156,8 @@ def read_evaluation(file: Path) -> dict[str, Any]:
     for part, names in _PARTS.items():
         if not isinstance(record.get(part), dict):
             raise DataError("is missing", file=file, field=part)
+        if part == "config":
+            record[part].setdefault("pace", 0.0)  # of before there was one
         if lost := set(names) - record[part].keys():
             raise DataError("is missing", file=file, field=f"{part}.{min(lost)}")
     return record
