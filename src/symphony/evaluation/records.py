@@ -37,7 +37,7 @@ _USUAL = {
 _PARTS: dict[str, tuple[str, ...]] = {
     "run": ("updates", "checkpoint", "named"),
     "data": ("name", "checksum"),
-    "config": (*_NAMED, *_USUAL, "duration", "seed", "metric"),
+    "config": (*_NAMED, "duration", "seed", "metric"),
     "cost": ("simulation",),
 } | dict.fromkeys(("playback", "constant_velocity", "curvature"), ())
 """Entries that a kept evaluation must have."""
@@ -156,11 +156,10 @@ def read_evaluation(file: Path) -> dict[str, Any]:
     for part, names in _PARTS.items():
         if not isinstance(record.get(part), dict):
             raise DataError("is missing", file=file, field=part)
-        if part == "config":
-            record[part].setdefault("pace", 0.0)  # of before there was one
         if lost := set(names) - record[part].keys():
             raise DataError("is missing", file=file, field=f"{part}.{min(lost)}")
-    return record
+    # What was not a setting yet was as is usual.
+    return record | {"config": _USUAL | record["config"]}
 
 
 def fitting(kept: Iterable[str], patterns: Sequence[str]) -> list[str]:
