@@ -141,8 +141,7 @@ def test_agents_that_can_do_no_better_are_excused_and_hide_no_others():
         return torch.cat([torch.ones_like(second), second], -1)
 
     free, found = (look(start, rule, score=score) for rule in (KeepAll(), rule))
-    assert (found.scores[..., 0] == 1).all()
-    assert (found.totals >= 1).all()
+    assert min(found.scores[..., 0].min(), found.totals.min()) == 1
     bad, left = ((each.scores[..., 1] > 0).any(-1).float().mean() for each in (free, found))
     assert bad > 0.5 > 3 * left
     assert found.simulated_steps < 3 * free.simulated_steps

@@ -143,12 +143,13 @@ def follow(
         ending = (at == periods - 1) & (short > 0)
         judged = run._replace(scores=run.scores.masked_fill(excused[:, None, None], 0.0))
         totals, those = total(run)[:, 0], total(judged)[:, 0]
-        worst = judged.scores[:, 0].amax(1)
+        counted = run.scores[:, 0].masked_fill(excused[:, None], -torch.inf)
+        worst = counted.amax(1)
         if short:
             # The last period is simulated as long as the others: what lies past its end is neither counted nor kept.
             totals = torch.where(ending, total(run, short)[:, 0], totals)
             those = torch.where(ending, total(judged, short)[:, 0], those)
-            worst = torch.where(ending[:, None], judged.scores[:, 0, :short].amax(1), worst)
+            worst = torch.where(ending[:, None], counted[:, :short].amax(1), worst)
         simulated = simulated + every * len(line) - ending.sum() * (every - short)
         alive = run.alive.any(-1)
         if history is None:
@@ -164,7 +165,7 @@ def follow(
             all_alive.index_copy_(0, place + k, alive[:, 0, k])
         all_totals.index_copy_(0, line * periods + at, totals)
         # An episode that has ended can't be bad any more; a line that goes back goes to before its end.
-        bad = ~(those <= rule.threshold) & alive[:, 0, 0]
+        bad = ~(those <= rule.threshold) & alive[:, 0, 0] & ~excused.all(-1)
         goes = course.judge(line, bad, ~(worst < worst.amax(-1, keepdim=True))).nonzero().squeeze(-1)
         now, over = run.after.select(*entries), run.ended.index_fill(0, goes, False)
         if len(goes):

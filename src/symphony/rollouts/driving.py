@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from symphony import keys
@@ -130,7 +130,8 @@ def simulation(
         what = "so it can't go back: --search none or tree, and is not compiled: --compile no"
         raise ConfigError(f"a planner remembers what it saw, {what}")
     planned = EgoPolicy(env, egos, start, config.seed, CarFollower, forked=searches) if egos else None
-    lure, actor = None if toward is None else toward(env, start), _acting(guard, env, config)
+    lure = None if toward is None else toward(env, start)
+    actor = TensorDictSequential(guard, RULES[config.others](env)) if config.others in RULES else guard
     for module in (planned, lure):
         actor = actor if module is None else TensorDictSequential(actor, module)
     # The rollouts [B, trees, taken] that count, of all branches.
@@ -199,11 +200,6 @@ def simulate_batch(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, **h
     return Simulation(log, torch.full_like(log.state[:, :, 0, :, 0], -1, dtype=torch.int64), None, at_states)
 
 
-def _acting(policy: TensorDictModuleBase, env: PlannedEnv, config: EvaluateConfig) -> TensorDictModuleBase:
-    """Return a policy, followed by the rule that drives background agents."""
-    return TensorDictSequential(policy, RULES[config.others](env)) if config.others in RULES else policy
-
-
 def _ruled(
     agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given: Int[Tensor, "B N"] | None
 ) -> tuple[SceneBatch, EvaluateConfig]:
@@ -218,6 +214,8 @@ def _ruled(
 
 
 def _check_given(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given: Int[Tensor, "B N"] | None) -> None:
+    if config.pace and agent.spec is None:
+        raise ConfigError(f"{agent.name} is no learned agent, so a pace has no effect")
     if given is None or agent.goals is not None or agent.rule:
         return
     follows = scenes.background & (config.others == "idm")

@@ -256,7 +256,7 @@ def simulated_how(agent: Agent, settings: WosacSettings) -> dict[str, Any]:
         "seed": (True, settings.seed),
         "horizon": (settings.future != FUTURE, settings.horizon),
         "logged_goals": (agent.goals is not None, settings.logged_goals),
-        "pace": (agent.policy is not None, settings.pace),
+        "pace": (agent.spec is not None, settings.pace),
         "score": (kind != "none" and pruning.score != "discriminator", pruning.score),
         "branches": (kind == "tree", branches),
         "rule": (kind == "tree", pruning.rule),
@@ -388,5 +388,5 @@ class _SegmentScorer:
         if agent.name == BASELINES[1]:
             return constant_velocity(window, self.settings.future)
         # What a search is told concerns the agent alone, which is the last one.
-        plain = dataclasses.replace(self.settings, search="none", pace=0.0)
+        plain = dataclasses.replace(self.settings, search="none")
         return wosac_rollouts(agent, window, self.settings if agent is self.agents[-1] else plain)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -128,6 +129,7 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings) -
     rows, held = _present(segment), standing(segment)
     segment = segment.replace(velocity=np.where(held[:, None, None], np.float32(0), segment.velocity))
     dt = DT if agent.spec is None else agent.spec.dt
+    settings = settings if agent.spec else replace(settings, pace=0.0)  # baselines are as they are
     start = history_only(segment, dt, settings.future)
     is_vehicle = start.agent_type == AgentType.VEHICLE
     graph = LaneGraph(start.road)
