@@ -258,7 +258,8 @@ def test_names_differ_with_everything_that_changes_results() -> None:
     assert evaluation_name(others[0] | {"config": others[0]["config"] | changes}) == names[1]
     # Included agents keep evaluations by such names, some of before there was a pace.
     replace = make_record(**TREE | {"rule": "replace", "prune_every": 2, "threshold": 1.0, "goals": "branch"})
-    assert evaluation_name(replace).replace("ab" * 6, "0cfa3e8c0824") in kept_evaluations(FOLDER / "mgail_ts_h")
+    kept = kept_evaluations(FOLDER / "mgail_ts_h")[evaluation_name(replace).replace("ab" * 6, "0cfa3e8c0824")]
+    assert (kept["config"]["pace"], kept["config"]["score"]) == (0, "discriminator")
 
 
 @settings(max_examples=20)

@@ -198,10 +198,9 @@ def test_what_a_planner_does_wrong_ends_its_run_only(store: Path, told: Any, bod
     ("--planner idm --planner-seconds inf", "planner-seconds must be above 0"),
     ("--planner pipe:'foo", "No closing quotation"), ("--planner idm --segments 0 0", "is named twice: 0, 0"),
     ("--goal 7=3,4", "follows no goals"), ("--pace 0.5", "no learned agent"),
-    ("--device foo", "unknown device 'foo'"),
     *((f"--planner exits{end}:plan", "SystemExit") for end in ("", ".py")),
     *((f"--planner wrong{end}:plan", "SyntaxError") for end in ("", ".py")),
-    ("--search tree --rule math:sqrt", "can't be called as needed"),
+    ("--search tree --rule math:sqrt", "can't be called as needed"), ("--device foo", "unknown device 'foo'"),
 ])  # fmt: skip
 def test_one_line_names_the_mistake(store: Path, told: Any, words: str, message: str) -> None:
     Path("exits.py").write_text("exit()\n")
