@@ -1,8 +1,7 @@
 """One recipe for each row of the paper's tables: networks, environment, collector, losses, the order of updates.
 
-A recipe is a function from a configuration to a trainer that is ready to run, meant to be read from top to bottom.
-Recipes repeat one another on purpose; no other package knows the methods. In a checkout the files lie at the top, in
-``recipes``, and each is also a script.
+A recipe is a function from a configuration to a trainer, meant to be read from top to bottom. Recipes repeat one
+another on purpose; no other package knows the methods. In a checkout each file of ``recipes`` is also a script.
 """
 
 from __future__ import annotations
@@ -32,15 +31,14 @@ def train(config: TrainConfig, recipe: Recipe | None = None) -> Path:
 
     Args:
         config: of the run.
-        recipe: builds the trainer; by default that of the configured method.
+        recipe: of the run; by default that of the configured method.
 
     Returns:
         The run's folder (see :meth:`symphony.training.Trainer.run`).
 
     Raises:
         ConfigError: if the folder holds another run, or settings can't be used.
-        DataError: if a store can't be read or holds nothing to learn from, or the disk refuses.
-        TrainingError: if gradients stay infinite or undefined.
+        DataError: if a store can't be read or has nothing to learn from; TrainingError: if gradients stay not finite.
     """
     with processes(usable_device(config.device)) as world:
         return trainer_of(config, world, recipe).run()

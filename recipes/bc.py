@@ -13,9 +13,8 @@ from symphony.training import Phase, Processes, Trainer, Updates, cosine
 def bc(config: TrainConfig, processes: Processes) -> Trainer:
     """Imitate the logged actions of every vehicle that moves or waits."""
     torch.manual_seed(config.seed)
-    rng, device = torch.Generator(), processes.device
-    store, dynamics = SegmentStore(config.data), bicycle(config.agent)
-    data = SceneDataset(store, dynamics=dynamics, routes=False, **config.scenes)
+    rng, device, dynamics = torch.Generator(), processes.device, bicycle(config.agent)
+    data = SceneDataset(SegmentStore(config.data), dynamics=dynamics, routes=False, **config.scenes)
 
     # Networks.
     spec = config.spec("bicycle", data.dt)
@@ -25,7 +24,6 @@ def bc(config: TrainConfig, processes: Processes) -> Trainer:
     # Losses and optimizers.
     policy_loss = processes.wrap_ddp(BCLoss(policy))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
-    rates = config.rates(optimizers)
 
     # The order of updates.
     def update(step: int) -> Updates:
@@ -33,7 +31,7 @@ def bc(config: TrainConfig, processes: Processes) -> Trainer:
         experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
         yield "policy", policy_loss(experts)
 
-    phases = [Phase(config.steps, update, cosine(rates, config.steps))]
+    phases = [Phase(config.steps, update, cosine(config.rates(optimizers), config.steps))]
     return Trainer(config, agent, data, phases, optimizers, rng, processes)
 
 

@@ -14,9 +14,8 @@ from symphony.training import Phase, Processes, Trainer, Updates, cosine
 def bc_h(config: TrainConfig, processes: Processes) -> Trainer:
     """Imitate the logged actions given the route that was taken, and learn which routes are taken."""
     torch.manual_seed(config.seed)
-    rng, device = torch.Generator(), processes.device
-    store, dynamics = SegmentStore(config.data), bicycle(config.agent)
-    data = SceneDataset(store, dynamics=dynamics, routes=True, **config.scenes)
+    rng, device, dynamics = torch.Generator(), processes.device, bicycle(config.agent)
+    data = SceneDataset(SegmentStore(config.data), dynamics=dynamics, routes=True, **config.scenes)
 
     # Networks.
     spec = config.spec("bicycle", data.dt, goals=True)
@@ -24,10 +23,8 @@ def bc_h(config: TrainConfig, processes: Processes) -> Trainer:
     agent = Agent(str(config.out), policy, spec, goals).to(device)
 
     # Losses and optimizers.
-    policy_loss = processes.wrap_ddp(BCLoss(policy))
-    goal_loss = processes.wrap_ddp(GoalLoss(goals))
+    policy_loss, goal_loss = processes.wrap_ddp(BCLoss(policy)), processes.wrap_ddp(GoalLoss(goals))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
-    rates = config.rates(optimizers)
 
     # The order of updates.
     def update(step: int) -> Updates:
@@ -36,7 +33,7 @@ def bc_h(config: TrainConfig, processes: Processes) -> Trainer:
         yield "policy", policy_loss(experts)
         yield "goals", goal_loss(data.sample_goals(items, GOALS, observation, rng, device))
 
-    phases = [Phase(config.steps, update, cosine(rates, config.steps))]
+    phases = [Phase(config.steps, update, cosine(config.rates(optimizers), config.steps))]
     return Trainer(config, agent, data, phases, optimizers, rng, processes)
 
 

@@ -1,7 +1,6 @@
 """Behavioural cloning with goals, and a policy gradient against collisions in closed loop: not in the paper.
 
-Made for an agent that drives already (`--warm-start`). Nothing prunes its rollouts; the included agent had eight of
-each run segment (`--search.branches 8`).
+It is for an agent that drives already (`--warm-start`). The included ones had `--search.branches 8`.
 """
 
 from __future__ import annotations
@@ -22,43 +21,40 @@ from symphony.training import Phase, Processes, Trainer, Updates, cosine
 def bc_rl_h(config: TrainConfig, processes: Processes) -> Trainer:
     """Imitate the log, and make what led to collisions and off the road less likely than what did not."""
     torch.manual_seed(config.seed)
-    seed, rng, device = processes.seed(config.seed), torch.Generator(), processes.device
-    store, dynamics = SegmentStore(config.data), bicycle(config.agent)
-    data = SceneDataset(store, dynamics=dynamics, routes=True, **config.scenes)
+    seed, rng, dynamics = processes.seed(config.seed), torch.Generator(), bicycle(config.agent)
+    data = SceneDataset(SegmentStore(config.data), dynamics=dynamics, routes=True, **config.scenes)
 
     # Networks.
     spec = config.spec("bicycle", data.dt, goals=True)
     policy, goals = policy_network(spec), goal_network(spec)
-    agent = Agent(str(config.out), policy, spec, goals).to(device)
+    agent = Agent(str(config.out), policy, spec, goals).to(processes.device)
 
-    # Environment and collector: all branches go on, with goals of their own.
-    env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=device)
-    rows, rule = config.rows(len(data)), KeepAll()
+    # Environment and collector: nothing is pruned, and each branch has its own goals.
+    env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=processes.device)
+    rows = config.rows(len(data))
     collector = BeamSearchCollector(
         with_rows(env, [rows]),
         TensorDictSequential(SeededNoise(seed, dynamics.numbers), policy),
         score=realism_score(env, None, score="flags"),
         prepare=lambda start: with_drawn_goals(env, goals, start, seed, config.search.goals),
-        **collector_settings(config.search, env, seed, data, rows, rule),
+        **collector_settings(config.search, env, seed, data, rows, KeepAll()),
     )
     replay = SearchReplay(collector, env, data, config.search.updates, config.search.states, config.segments)
 
     # Losses and optimizers.
-    policy_loss = processes.wrap_ddp(DistillationLoss(policy))
-    goal_loss = processes.wrap_ddp(GoalLoss(goals))
+    policy_loss, goal_loss = processes.wrap_ddp(DistillationLoss(policy)), processes.wrap_ddp(GoalLoss(goals))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
-    rates = config.rates(optimizers)
 
     # The order of updates.
     def update(step: int) -> Updates:
         items, observation = data.draw(config.segments, rng), observation_of(spec)
         yield "search", replay.refresh(step)
-        experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
+        experts = data.sample_states(items, config.states, observation, rng, env.device, config.perturb.at(step))
         rollouts = replay.blamed(config.search.states, rng, observation)
         yield "policy", policy_loss(with_survivors(experts, rollouts))
-        yield "goals", goal_loss(data.sample_goals(items, GOALS, observation, rng, device))
+        yield "goals", goal_loss(data.sample_goals(items, GOALS, observation, rng, env.device))
 
-    phases = [Phase(config.steps, update, cosine(rates, config.steps))]
+    phases = [Phase(config.steps, update, cosine(config.rates(optimizers), config.steps))]
     return Trainer(config, agent, data, phases, optimizers, rng, processes, replay)
 
 

@@ -17,17 +17,16 @@ from symphony.training import Phase, Processes, Trainer, Updates, cosine
 def bc_ts(config: TrainConfig, processes: Processes) -> Trainer:
     """Learn from the log, and from rollouts of a beam search that the discriminator prunes."""
     torch.manual_seed(config.seed)
-    seed, rng, device = processes.seed(config.seed), torch.Generator(), processes.device
-    store, dynamics = SegmentStore(config.data), bicycle(config.agent)
-    data = SceneDataset(store, dynamics=dynamics, routes=False, **config.scenes)
+    seed, rng, dynamics = processes.seed(config.seed), torch.Generator(), bicycle(config.agent)
+    data = SceneDataset(SegmentStore(config.data), dynamics=dynamics, routes=False, **config.scenes)
 
     # Networks.
     spec = config.spec("bicycle", data.dt, discriminator=True, searches=True)
     policy, discriminator = policy_network(spec), discriminator_network(spec)
-    agent = Agent(str(config.out), policy, spec, discriminator=discriminator).to(device)
+    agent = Agent(str(config.out), policy, spec, discriminator=discriminator).to(processes.device)
 
     # Environment and collector: the discriminator prunes branches of every segment.
-    env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=device)
+    env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=processes.device)
     rows, rule = config.rows(len(data)), pruning_rule(config.search)
     collector = BeamSearchCollector(
         with_rows(env, [rows]),
@@ -42,18 +41,17 @@ def bc_ts(config: TrainConfig, processes: Processes) -> Trainer:
     policy_loss = processes.wrap_ddp(DistillationLoss(policy))
     realism_loss = processes.wrap_ddp(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
-    rates = config.rates(optimizers)
 
     # The order of updates.
     def update(step: int) -> Updates:
         items, observation = data.draw(config.segments, rng), observation_of(spec, discriminator=False)
         yield "search", replay.refresh(step)
         yield "discriminator", realism_loss(replay.both_kinds(rng))
-        experts = data.sample_states(items, config.states, observation, rng, device, config.perturb.at(step))
+        experts = data.sample_states(items, config.states, observation, rng, env.device, config.perturb.at(step))
         rollouts = replay.survivors(config.search.states, rng, observation)
         yield "policy", policy_loss(with_survivors(experts, rollouts))
 
-    phases = [Phase(config.steps, update, cosine(rates, config.steps))]
+    phases = [Phase(config.steps, update, cosine(config.rates(optimizers), config.steps))]
     return Trainer(config, agent, data, phases, optimizers, rng, processes, replay)
 
 

@@ -36,7 +36,7 @@ from symphony.training import Trainer
 from symphony.training.logging import read_metrics
 
 NETWORKS = {"bc": {"policy"}, "bc_h": {"policy", "goals"}, "bc_ts": {"policy", "discriminator"}}
-NETWORKS |= {"bc_rl_h": NETWORKS["bc_h"], "bc_ts_h": {"policy", "goals", "discriminator"}}
+NETWORKS |= {"bc_rl": {"policy"}, "bc_rl_h": NETWORKS["bc_h"], "bc_ts_h": {"policy", "goals", "discriminator"}}
 METHODS: tuple[Any, ...] = tuple(NETWORKS)
 ROUTED = ObservationConfig(num_objects=4, num_points=12, route=True)
 Trained = Callable[..., Path]

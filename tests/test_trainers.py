@@ -223,7 +223,7 @@ COMMON = "--steps 3 --states 16 --agent.hidden 8 --agent.num-points 10 --wandb d
 SEARCH = "--search.branches 2 --search.prune-every 3 --search.test-branches 2 --search.updates 2 --search.states 8"
 ADVERSARIAL = "--mgail.regression 1 --mgail.head-start 1 --mgail.rollouts 2"
 ARGUMENTS = {"bc": COMMON, "bc_h": COMMON}
-ARGUMENTS |= dict.fromkeys(("bc_ts", "bc_ts_h", "bc_rl_h"), f"{COMMON} {SEARCH} --checkpoint-every 2")
+ARGUMENTS |= dict.fromkeys(("bc_ts", "bc_ts_h", "bc_rl", "bc_rl_h"), f"{COMMON} {SEARCH} --checkpoint-every 2")
 ARGUMENTS |= dict.fromkeys(("mgail", "mgail_h", "mgail_ts", "mgail_ts_h"), f"{ARGUMENTS['bc_ts']} {ADVERSARIAL}")
 
 

@@ -19,8 +19,8 @@ Row = Literal["bc", "bc_h", "bc_ts", "bc_ts_h", "mgail", "mgail_h", "mgail_ts", 
 hierarchy), with tree search (TS), with both.
 """
 METHODS: tuple[str, ...] = get_args(Row)
-Method = Literal[Row, "bc_rl_h"]
-"""Methods that have a recipe: also BC+H with a policy gradient (RL), which is not in the paper."""
+Method = Literal[Row, "bc_rl", "bc_rl_h"]
+"""Methods that have a recipe: also BC and BC+H with a policy gradient (RL), which is not in the paper."""
 Cost = Literal["log_d", "non_saturating", "logit"]
 GOALS = 128
 """Expert routes per update of the goal policy."""
@@ -125,7 +125,7 @@ class RunConfig(Settings):
 class TrainConfig(RunConfig):
     """All settings of a training."""
 
-    #: Method to train: behavioural cloning or MGAIL, with goals (h), with tree search (ts), with both; `bc_rl_h`:
+    #: Method to train: behavioural cloning or MGAIL, with goals (h), with tree search (ts), with both; with `rl`:
     #: cloning and a policy gradient against collisions in closed loop, for an agent that drives (--warm-start).
     method: Positional[Method]
     #: Seconds of each run segment that are used (the paper: 10 and 20; 0: all there are).
