@@ -105,7 +105,11 @@ def guarded(action: Callable[[], object]) -> int:
         # The reader of our output, such as `head`, has gone; Python would print another error as it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
-    except KeyboardInterrupt as stop:
+    except (KeyboardInterrupt, RuntimeError) as error:
+        # Where an interrupt comes while TensorDict lends weights to a module, it raises an error of its own.
+        stop = error.__context__ if isinstance(error, RuntimeError) else error
+        if not isinstance(stop, KeyboardInterrupt):
+            raise
         return _complain(str(stop) or "interrupted", TERMINATED if str(stop) else INTERRUPTED)
     except (errors.SymphonyError, OSError) as error:
         usage, failed = isinstance(error, errors.CouldNotRunError), isinstance(error, errors.AllFailedError)

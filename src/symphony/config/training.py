@@ -15,9 +15,7 @@ from symphony.config.evaluation import Compile, compiles
 from symphony.keys import SEEN
 
 Row = Literal["bc", "bc_h", "bc_ts", "bc_ts_h", "mgail", "mgail_h", "mgail_ts", "mgail_ts_h"]
-"""Rows of the paper's tables: behavioural cloning or adversarial imitation through the model (MGAIL), with goals (H:
-hierarchy), with tree search (TS), with both.
-"""
+"""Rows of the paper's tables: behavioural cloning or MGAIL, with goals (H: hierarchy), tree search (TS), or both."""
 METHODS: tuple[str, ...] = get_args(Row)
 Method = Literal[Row, "bc_rl", "bc_rl_h"]
 """Methods that have a recipe: also BC and BC+H with a policy gradient (RL), which is not in the paper."""

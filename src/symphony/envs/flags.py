@@ -24,9 +24,7 @@ _PAIRS = 1 << 20  # positions times edges that are measured at a time where the 
 
 
 def collision_flags(objects: Objects, index: Int[Tensor, "M N"]) -> Bool[Tensor, "M N"]:
-    """Return whether the oriented box of each agent ``index`` overlaps any other valid box on its level (touching
-    does not count).
-    """
+    """Return whether the oriented box of each agent ``index`` overlaps, not only touches, another on its level."""
     state, size, other = objects.state.detach()[:, None], objects.size[:, None], objects.others(index)
     own, own_size = (rows_of(value[:, 0], index)[:, :, None] for value in (state, size))
     if not on_host(index):

@@ -191,8 +191,7 @@ def segments_of(
 
     Line k is ``points[offsets[k]:offsets[k + 1]]``. A line whose last point lies within :data:`CLOSED_WITHIN` of its
     first one is a ring; a line that starts where exactly one other line ends continues it. Repeated points are
-    dropped. Returns start [E, 2], end [E, 2], and the indices [E] of the previous and the following segment (-1:
-    none).
+    dropped. Returns start [E, 2], end [E, 2], and the indices [E] of previous and following segments (-1: none).
     """
     points = np.asarray(points)[:, :2]
     counts = np.diff(offsets)
