@@ -359,11 +359,9 @@ def test_saved_rollouts_are_as_high_as_in_the_simulation() -> None:
     saved = played(segment, [1, 0], rollouts=2, start=4)
     saved = replace(saved, state=saved.state[:, :3:-1].copy(), counted=saved.counted[:, 4:])
     expected = rollout_heights(scene(segment, [1, 0]), torch.from_numpy(saved.state)[None])
-    assert expected is not None
     assert float(expected[..., 0].std()) > 0.5
     for k in (0, 1):
         found = world_of(saved, k).height
-        assert found is not None
         np.testing.assert_array_equal(found[[1, 0]], expected[0, k].transpose(0, 1))
         np.testing.assert_array_equal(found[2], agent_heights(segment)[4:, 2])
     assert world_of(played(overpass(0.0)), 0).height is None

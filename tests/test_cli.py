@@ -317,8 +317,7 @@ def test_every_profile_is_a_valid_configuration_of_every_method(profile: str) ->
     assert (config == settings("mgail_ts_h")) == (profile == "default")
     for method in METHODS:
         assert replace(config, method=method).method == method  # which looks whether the rest suits it
-    spaces: tuple[Any, ...] = ("bicycle", "displacement")
-    for actions in spaces:
+    for actions in ("bicycle", "displacement"):
         spec = config.spec(actions, 0.2, goals=True, discriminator=True, searches=True)
         agent = Agent("built", policy_network(spec), spec, goal_network(spec), discriminator_network(spec))
         assert set(agent.modules) == {"policy", "goals", "discriminator"}

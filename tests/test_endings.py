@@ -106,7 +106,6 @@ raise SystemExit(cli.main(["data", "verify", "x"]))
 def test_a_terminated_command_says_so():
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     process = subprocess.Popen([sys.executable, "-c", SLOW], **pipes)
-    assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
     process.terminate()
     _, error = process.communicate(timeout=60)

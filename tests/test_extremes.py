@@ -305,7 +305,6 @@ def test_what_comes_after_the_end_of_a_segment_is_none_of_its_business(store: Se
 def test_a_run_that_breaks_while_it_trains_is_not_validated_in_silence(store, tmp_path):
     validation = ValidationConfig(data=store.path, rollouts=1)
     trainer = build(tiny("bc", store.path, tmp_path / "run", validation=validation))
-    assert trainer.validator is not None
     with torch.no_grad():
         for parameter in trainer.agent.modules["policy"].parameters():
             parameter.fill_(math.inf)

@@ -74,7 +74,6 @@ def test_a_search_is_kept_with_its_leaves_and_goals(tmp_path):
     for saved, again in zip(found, folder, strict=True):
         assert_same(saved, again)
         trees = again.trees
-        assert trees is not None
         steps = np.arange(again.steps)
         # A leaf is what its slots simulated, one period after the other.
         for k in range(again.rollouts):

@@ -123,7 +123,6 @@ def test_files_of_another_version_are_refused_and_left_alone(run, store, part, f
 
 def test_a_damaged_last_checkpoint_is_named_and_the_one_before_it_can_be_used(run, store, part):
     last = latest(part / "checkpoints")
-    assert last is not None
     file = last / "module.policy.safetensors"
     file.write_bytes(file.read_bytes()[:-1])
     settings = tiny("bc", store, part, resume=True)
@@ -165,7 +164,6 @@ def test_two_processes_on_one_run_are_refused_and_the_lock_dies_with_its_process
     before, settings = learned(part), tiny("bc", store, part, resume=True)
     command = [sys.executable, "-c", LOCKED, str(part / training.LOCK)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         who = rf"part: is being written by another process: {other.pid} on .*: -c "
         with pytest.raises(DataError, match=who):
@@ -273,7 +271,6 @@ def test_a_run_of_two_is_not_taken_up_by_one(found: Found) -> None:
     told = (found[0] / "alone.txt").read_text()
     assert "trained by 2 processes so far, can't be resumed by 1" in told
     last = latest(found[0] / "bc" / "checkpoints")
-    assert last is not None
     assert load_checkpoint(last, partial=True, restore_rng=False).extra["processes"] == 2
 
 

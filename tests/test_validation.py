@@ -160,7 +160,6 @@ def test_segments_are_spread_over_the_store(store: Path, held_out: Path, tmp_pat
     for count, wanted in ((1, [0]), (2, [0, 2]), (3, [0, 1, 2]), (9, [0, 1, 2, 3])):
         some = ValidationConfig(data=held_out, rollouts=2, segments=count)
         validator = build(config(store, tmp_path, held_out, validation=some)).validator
-        assert validator is not None
         assert validator.dataset.indices == wanted
 
 

@@ -123,7 +123,6 @@ def test_the_page_holds_all_segments_and_loads_nothing(tmp_path: Path) -> None:
     page = (tmp_path / "sim" / "view.html").read_text(encoding="utf-8")
     assert [unpacked(block)[0]["id"] for block in blocks(page)] == [s.segment.segment_id for s in found]
     about = re.search(r'<script type="application/json" id="about">(.*?)</script>', page)
-    assert about is not None
     assert json.loads(about[1])["names"] == [ABOUT.agent]
     assert "http" not in re.sub(r'id="segment-\d+">[^<]*', "", page)
     assert not re.search(r"\b(src|href)\s*=|@import|url\(|fetch\(|XMLHttpRequest|import\(", page)

@@ -188,7 +188,6 @@ def test_workers_end_with_the_command(store: SegmentStore, tmp_path: Path, how: 
     while len(list((tmp_path / "started").iterdir())) < 2 and time.monotonic() < until:
         assert process.is_alive()
         time.sleep(0.1)
-    assert process.pid is not None
     os.kill(process.pid, how)
     process.join(90)  # before its workers end by themselves
     process.kill()  # where it goes on
@@ -292,6 +291,21 @@ def test_leaving_early_abandons_what_is_under_way(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["quick"]
 
 
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_signals_wait_for_a_worker_that_is_being_started(how: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def submit(*task: Any) -> None:
+        os.kill(os.getpid(), how)
+        begun.append(task)
+
+    begun: list[Any] = []
+    monkeypatch.setattr("symphony.parallel.ProcessPoolExecutor.submit", submit)
+    before = signal.signal(how, signal.default_int_handler)
+    with pytest.raises(KeyboardInterrupt):
+        list(ordered_map(abs, [1, 2], workers=2))
+    signal.signal(how, before)
+    assert len(begun) == 1
+
+
 SCRIPT = """
 import os, time
 from symphony.parallel import ordered_map
@@ -311,8 +325,6 @@ def test_workers_end_with_the_process_that_started_them(how: str, tmp_path: Path
     command = [sys.executable, str(tmp_path / "script.py")]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, text=True, start_new_session=True, **pipes) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
         pids = [int(process.stdout.readline()) for _ in range(2)]
         if how == "SIGINT":  # as Ctrl-C does: to the whole group
             os.killpg(process.pid, signal.SIGINT)

@@ -78,18 +78,18 @@ def get_ready(imports: Sequence[str]) -> None:
 
 
 @contextlib.contextmanager
-def _starting() -> Iterator[None]:
+def _starting(put_off: Sequence[int] = (signal.SIGINT,)) -> Iterator[None]:
     """Give processes started inside the environment of workers; they put off interrupts: the parent's are enough."""
     before = {name: os.environ[name] for name in WORKER_ENVIRONMENT if name in os.environ}
     try:
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        signal.pthread_sigmask(signal.SIG_BLOCK, put_off)
         os.environ.update(WORKER_ENVIRONMENT)
         yield
     finally:
         for name in WORKER_ENVIRONMENT:
             os.environ.pop(name, None)
         os.environ.update(before)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, put_off)
 
 
 def _ahead(submit: Callable[[T], Any], tasks: Iterator[T], count: int) -> Iterator[deque[Any]]:
@@ -109,7 +109,7 @@ def _local_map(function: Callable[[T], R], tasks: Iterator[T], workers: int, nam
     pool = ProcessPoolExecutor(workers, context, _begin_worker, (lifeline, environment))
 
     def submit(task: T) -> Any:
-        with _starting():  # processes are started here, as they are needed
+        with _starting((signal.SIGINT, signal.SIGTERM)):  # started as they are needed; half a start is not tidied up
             return pool.submit(function, task)
 
     pending, done = deque[Any](), 0
