@@ -19,8 +19,7 @@ def load_object(path: str, *, here: bool = True) -> Any:
     """Import ``module:name``, or ``path/to/file.py:name``, with what lies beside the file to import.
 
     Unless ``here`` is False, modules are also sought in the current folder, as ``python -m`` does. Not for paths that
-    the user did not type: whatever lies in the folder would run. A :class:`ConfigError` says what is missing, or why
-    it can't be imported.
+    the user did not type: whatever lies in the folder would run. A :class:`ConfigError` says what is missing, or why.
     """
     module, _, name = path.rpartition(":")
     load = _file if module.endswith(".py") else importlib.import_module

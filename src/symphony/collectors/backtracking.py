@@ -75,9 +75,7 @@ class Course:
     def judge(
         self, line: Int[Tensor, " R"], bad: Bool[Tensor, " R"], worst: Bool[Tensor, "R N"]
     ) -> Bool[Tensor, " R"]:
-        """Move lines to their next periods, given whether the period they ended was bad, and whose trouble that was;
-        return which go back.
-        """
+        """Move lines to new periods, given which ended badly and whose trouble that was; return which go back."""
         at, tries, front = self.at[line], self.tries[line], self.front[line]
         blame = torch.where((tries == 0)[:, None], worst, worst & self.blame[line])
         failed = bad & (tries >= len(self.back))

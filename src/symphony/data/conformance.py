@@ -92,10 +92,9 @@ def check_segments(segments: Sequence[RunSegment]) -> Conformance:
 def check_reader(reader: Reader, files: Iterable[str | Path]) -> Conformance:
     """Check a reader with a few good files of its format, with moving vehicles.
 
-    Besides the checks of :func:`check_segments`: ``errors`` (reading raises nothing but :class:`DataError`, which
-    names the file), ``source`` (segments name format and file) and ``determinism`` (reading again, in another order,
-    gives equal content). Errors of single records are allowed and reported. A :class:`ConformanceError` names every
-    check that failed.
+    Beside :func:`check_segments`: ``errors`` (reading raises nothing but :class:`DataError`, which names the file),
+    ``source`` (segments name format and file) and ``determinism`` (reading again, in another order, gives equal
+    content). Errors of single records are allowed and reported. A :class:`ConformanceError` names all that failed.
     """
     paths = [Path(file) for file in files]
     report = Conformance()

@@ -232,9 +232,8 @@ def interactive_choice(segment: RunSegment, count: int, *, fewer: bool = False) 
     First the ego. Then one partner, chosen by context: the nearest of the agents the source marks as interacting,
     else of those it marks for prediction that move, else the one the ego merges with, crosses, follows or leads
     (:mod:`symphony.data.selection`; the one with the smallest time gap, then the nearest), else the nearest that
-    moves. Then the nearest that move. All are vehicles seen at the first step; "nearest" is to the ego at that
-    step, and agents seen at every step (which can be compared with the log throughout) go before the others, whatever
-    their context.
+    moves. Then the nearest that move. All are vehicles seen at the first step; "nearest" is to the ego at that step,
+    and agents seen at every step (comparable with the log throughout) go before the others, whatever their context.
 
     Raises a :class:`DataError` if there is no ego, or there are fewer than ``count`` (N_I, 2 or 8 in the paper); with
     ``fewer`` those are taken.

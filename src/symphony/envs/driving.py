@@ -82,11 +82,10 @@ class DrivingEnv(EnvBase):
         generator: the generator that draws them instead.
         device: the device of scenes from a source; others stay where they are.
 
-    ``reset(rows, set_state=False)`` starts the scenes named in their ``scene`` entry, or draws them at random;
-    where only some rows are reset, they start other scenes of those at hand. ``reset(state, set_state=True)`` starts
-    from the given simulation state. Raises a :class:`ConfigError` for an unknown name in ``ends_on`` or
-    ``after_collision``, both seed and generator, routes observed and not there, or agents that leave where traffic
-    is not open.
+    ``reset(rows, set_state=False)`` starts the scenes named in their ``scene`` entry, or draws them at random; rows
+    reset alone start other scenes of those at hand. ``reset(state, set_state=True)`` starts from the given simulation
+    state. Raises a :class:`ConfigError` for an unknown name in ``ends_on`` or ``after_collision``, both seed and
+    generator, routes observed and not there, or agents that leave where traffic is not open.
     """
 
     batch_locked = False

@@ -248,9 +248,7 @@ def _follow(
 
 
 class ConstantVelocity(TensorDictModuleBase):
-    """Keeps speed and heading: the weakest prediction a learned agent has to beat. Displacements need the time step
-    ``dt`` in seconds.
-    """
+    """Keeps speed and heading, the least an agent must beat. Displacements need the time step ``dt`` in seconds."""
 
     in_keys = [keys.STATE]  # noqa: RUF012 - the type TensorDictModuleBase declares
     out_keys = [keys.ACTION]  # noqa: RUF012

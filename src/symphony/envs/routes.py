@@ -123,9 +123,7 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
 def _carried(
     graph: LaneGraph, lines: Sequence[NDArray[np.float32]], length: float, speed: float
 ) -> dict[int, NDArray[np.float32]]:
-    """Return what is followed of those lines that end beside lanes that go on, by their number
-    (:func:`symphony.roadgraph.routes.carried_on`).
-    """
+    """Return what is followed of lines that end beside lanes that go on, by number (see :func:`carried_on`)."""
     ends, found = np.array([graph.lines[lane][-1] for lane in graph.drops], np.float32).reshape(-1, 2), {}
     for number, line in enumerate(lines):
         if len(line) < 2 or np.abs(ends - line[-1]).max(1).min(initial=np.inf) >= SAME:

@@ -139,8 +139,7 @@ class SceneBatch(TensorClass):
 
     Fields begin with the batch dimension, which their comments leave out. Routes are empty (R = 0) where not asked
     for. Heights and levels, see :mod:`symphony.data.levels`, are empty where no map has roads above each other; exits
-    and hull, see :class:`MapEdge`, where the same agents are driven from the first step to the
-    last.
+    and hull, see :class:`MapEdge`, where the same agents are driven throughout.
     """
 
     log_state: Tensor  # [T, A, 5] x, y, heading, velocity x, velocity y
@@ -274,8 +273,7 @@ def collate(scenes: Sequence[SceneBatch], agents: int = 0, shapes: dict[str, lis
     Padded steps repeat nothing: they are masked by ``log_valid`` and lie past ``last_step``. ``shapes`` of batches so
     far, by field, let this one be no smaller, and its sizes :func:`few`, for programs that are compiled for shapes:
     their number is at most one, and four for every doubling of a size since the first batch. Agents that are driven
-    and steps (:func:`with_few_steps`) are as many as there are. Raises a :class:`DataError` for scenes of different
-    time steps.
+    and steps (:func:`with_few_steps`) are as many as there are. A :class:`DataError` says if time steps differ.
     """
     steps = torch.cat([item.dt for item in scenes])
     if bool((steps != steps[0]).any()):
@@ -419,9 +417,7 @@ LIGHT_COLUMN = 6 + len(PointType)
 
 
 class Tables:
-    """Rows of features, flat indices and cells of the scenes of a batch, each made when first used; these must not
-    change.
-    """
+    """Rows of features, flat indices and cells of scenes, each made when first used; the scenes must not change."""
 
     def __init__(self, scenes: SceneBatch, config: ObservationConfig) -> None:
         self.scenes, self.config = scenes, config

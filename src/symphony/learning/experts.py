@@ -205,9 +205,7 @@ def expert_batch(
     action: Tensor | None = None,
     routes: RouteWindow | None = None,
 ) -> TensorDict:
-    """Return the observations of agents [M] in given states [M, 4] among all others as logged; with their actions and
-    what they see of their routes, where given.
-    """
+    """Return what agents [M] see in states [M, 4] among all others as logged; with actions and routes, if given."""
     index, here = agent[:, None], state[:, None]
     real = torch.ones_like(index, dtype=torch.bool)
     objects = objects_at(scenes, scene_of, step, here, index, real)

@@ -16,8 +16,7 @@ from symphony.geometry.frames import rotate, wrap
 ALONG, ACROSS = 1.5, 1.0
 """Seconds in which an error along and across the road dies out to a third or so."""
 AHEAD, ASIDE, TURNED, FASTER = 1.5, 0.5, 0.1, 1.5
-"""Standard deviations of displacements along the road and to the side in metres, in heading in radians and in speed
-in m/s."""
+"""Standard deviations of displacements along the road and aside (metres), in heading (radians) and in speed (m/s)."""
 SLOWEST = 2.0
 """m/s below which steering is not made harder, however slow the vehicle."""
 STEERING, BRAKING = 0.5, 4.0

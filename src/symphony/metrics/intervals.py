@@ -46,9 +46,7 @@ def grouped_mean(
 
 
 def clustered_mean(values: NDArray[np.float64], member: NDArray[np.int64]) -> tuple[float, float]:
-    """Return the mean of the finite values and its standard error, where those of one group (its number in
-    ``member``) are not independent.
-    """
+    """Return mean and standard error of finite values, where those of one group (``member``) are not independent."""
     known = np.isfinite(values)
     return ratio(values[known], np.ones(known.sum()), member[known])
 

@@ -202,8 +202,7 @@ def kind_of_contact(
 ) -> Int[Tensor, " M"]:
     """Return the :class:`CollisionKind` [M] of contacts from the point of view of the first agent.
 
-    Takes the poses of both before and after the step, the share of it after which they first overlap, and their
-    boxes.
+    Takes the poses of both before and after the step, the share of it until they overlap, and their boxes.
     """
     sizes = size_one, size_two
     turn = wrap(two[0][:, 2] - one[0][:, 2])

@@ -77,8 +77,7 @@ def sampling_floor(counts_log: NDArray[Any]) -> float:
 
     No policy is known to be better, however many rollouts it has. It is estimated by bootstrap samples of the
     segments, of which it takes the log's histograms [n, K], against all of them. Two logs of this size differ by
-    about twice as much. It is too low where segments of one recording are alike, or many turns are so rare that the
-    log has none.
+    about twice as much. It is too low where segments of one recording are alike, or many turns too rare for the log.
     """
     number = len(counts_log)
     often = np.random.default_rng(0).multinomial(number, np.full(number, 1 / number), size=DRAWS)

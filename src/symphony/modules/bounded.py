@@ -61,9 +61,7 @@ def displaced(share: Pairs, pace: Reals, slope: Reals, reach: float) -> Pairs:
 
 
 def shares(displacement: Pairs, pace: Reals, slope: Reals, reach: float, least: float = 1e-4) -> Pairs:
-    """Invert :func:`displaced`; what can't be reached has shares beyond 1. Less than `least` metres forward count as
-    `least`.
-    """
+    """Invert :func:`displaced`; shares beyond 1 can't be reached. Less than `least` metres forward count as that."""
     forward = displacement[..., 0].clamp_min(least)
     first = (forward - SMOOTH**2 / (4.0 * forward) - pace) / reach
     return torch.stack([first, displacement[..., 1] / (forward * slope)], -1)

@@ -234,8 +234,7 @@ class NoiseSampler(ProbabilisticTensorDictModule):
     it samples as its base class does.
 
     Takes the key of the logits `[..., C]`, or the keys of all parameters by their names; a categorical, or a class
-    with an `icdf`, and what else that takes. With `return_log_prob` the action's log-probability `[...]` is written,
-    too.
+    with an `icdf`, and what else that takes. `return_log_prob` also writes the log-probability `[...]`.
     """
 
     def __init__(

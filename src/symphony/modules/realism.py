@@ -26,8 +26,7 @@ class Discriminator(nn.Module):
     Own features include the route where there is one; the first two of an object and of a map or light point are its
     position in the agent's frame, in whose units ``radius`` says how far it observes. ``features`` are ``paper``;
     ``clearance``, which adds the signed gap to the box of each object and the signed distances of centre and corners
-    to the edge of the road; or ``foresight``, which adds to these the gaps at :data:`FORESIGHT` if all keep speed and
-    course.
+    to the edge of the road; or ``foresight``, which adds the gaps at :data:`FORESIGHT` if all keep speed and course.
     """
 
     def __init__(

@@ -231,8 +231,7 @@ class BCLoss(ActorLoss):
         actor_network: probabilistic module with a `get_dist`.
         reduction: `"mean"` over the valid entries (0 if there are none), `"sum"`, or `"none"`, which keeps the
             shape `[...]` of the log-probability, with zeros at invalid entries.
-        label_smoothing: share of the target spread evenly over all possible categories, in [0, 1); categorical actors
-            only.
+        label_smoothing: share of the target spread evenly over all categories, in [0, 1); categorical actors only.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_bc`, and for categorical actors, detached, `entropy` of the actor and `accuracy` of its mode
@@ -289,8 +288,7 @@ class DistillationLoss(ActorLoss):
         actor_network: probabilistic module with a `get_dist`, over discrete or continuous actions.
         reduction: `"mean"` as above (0 for a kind that is absent), `"sum"`, or `"none"`, which keeps the shape
             `[...]` of the log-probability, zeros where an entry does not count.
-        label_smoothing: share of the target spread evenly over all possible categories, in [0, 1); categorical actors
-            only.
+        label_smoothing: share of the target spread evenly over all categories, in [0, 1); categorical actors only.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_distillation` and, detached, `nll_expert` and `nll_rollout` (unweighted, without label smoothing);

@@ -5,8 +5,7 @@ NOW}``. It answers each with one line: ``reset`` with ``{}``, ``plan`` with ``{"
 it was asked about, and ``[acceleration, steering]``, ``[x, y, heading, speed]``, or a list of such states.
 ``{"error": "why"}`` ends the run, and so does anything else it writes to its standard output: a line more than it was
 asked for, one of another step, or one of more than :data:`LONGEST` bytes. Its input ends when the rollout does; then,
-after :data:`GRACE` seconds, whatever is left of its process group is killed. What it writes to its standard error is
-shown.
+after :data:`GRACE` seconds, what is left of its process group is killed. Its standard error is shown.
 
 Of the environment it gets ``PATH``, ``HOME``, ``LANG``, names that begin with ``PYTHON``, and those that
 ``SYMPHONY_PLANNER_ENV`` names, separated by commas.

@@ -60,8 +60,7 @@ def plot_curves(
 
     Given metrics have a panel each; by default all are drawn, related ones together, at most ``columns`` in a row. A
     point of the smoothed line is averaged over a share (``window``) of a run's records; 0 to not smooth. Raises a
-    :class:`ConfigError` for nothing to draw, a metric that no run has, a window out of range, or a file that is not a
-    png, pdf or svg.
+    :class:`ConfigError` for nothing to draw, a metric no run has, a window out of range, or a file not png, pdf, svg.
     """
     file = picture_path(path)
     if not 0 <= window <= 1:

@@ -84,8 +84,7 @@ def animate_rollouts(clips: Sequence[Clip], path: str | Path, *, columns: int = 
     Interactive agents are drawn where they are in every rollout, with the way they came; dashed is their way in the
     log, outlined where they were then. Playback agents and lights are shown as logged. The last frame is the last
     step; shorter segments end earlier and stay as they are. Where nothing moves all frames are the same. Panels are
-    at most ``size`` inches wide and high, and ``columns`` in a row. Raises a :class:`ConfigError` for a file that is
-    not a .gif.
+    at most ``size`` inches wide and high, and ``columns`` in a row. A :class:`ConfigError` says if a file is no .gif.
     """
     file = picture_path(path, ANIMATIONS)
     frames, interval = frames_of(clips, columns=columns, size=size)

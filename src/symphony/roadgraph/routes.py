@@ -183,8 +183,7 @@ def route_line(
     or half of that where it is too sharp. Where that is too sharp as well, nobody can drive the route.
 
     The line begins ``start`` metres along the first lane, where the vehicle has a speed in m/s; a route with a change
-    begins on the lane that is left. ``changes`` keeps lines up to where changes are over for routes that have the
-    same.
+    begins on the lane that is left. ``changes`` keeps lines up to the end of changes for routes with the same.
     """
     if not route.change:
         return paths.centre_line(graph, route.lanes, start)

@@ -41,8 +41,7 @@ class Crowd:
     traffic they enter and leave. Where there is a background, the other vehicles are driven, too, by a rule, up to
     :data:`MOST` with these; along routes, vehicles that are on no lane play back the log. Those ``also`` driven, by
     ids, come after the ego, beside the others. ``onward`` says how traffic goes on where the log ends before the
-    duration: those that enter then are driven by the agent if all are, else by the background's rule; without either
-    none enter.
+    duration: the agent drives those that enter then if it drives all, else the background's rule; else none enter.
     """
 
     count: int
@@ -103,9 +102,7 @@ class Crowd:
 
 
 class CrowdDataset(SceneDataset):
-    """Scenes in which a :class:`Crowd` is driven, of any size in each; other arguments are those of
-    :class:`SceneDataset`.
-    """
+    """Scenes in which a :class:`Crowd` is driven, of any size; other arguments are those of :class:`SceneDataset`."""
 
     def __init__(self, store: SegmentStore, crowd: Crowd, *given: Any, routes: bool = False, **named: Any) -> None:
         super().__init__(store, crowd.count, *given, routes=routes or crowd.along_routes, **named)

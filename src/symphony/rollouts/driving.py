@@ -187,9 +187,7 @@ def simulation(
 
 
 def simulate_batch(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, **how: Any) -> Simulation:
-    """Simulate an agent: :func:`playback` of the log, or a :func:`simulation`, whose arguments these are, with
-    collisions found between states, too.
-    """
+    """Return a :func:`playback` or :func:`simulation`, whose arguments these are, with collisions between states."""
     if agent.policy is not None or how.get("egos"):
         found = simulation(agent, scenes, config, **how)
         between = between_states(scenes, found.rollouts.state, existing(scenes, found.rollouts))
@@ -252,8 +250,7 @@ def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Si
 
 def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
     """Return the configuration beside a planner of the ego: without a search unless one is asked for, as a search
-    asks the planner once for each branch; else in trees of a few branches, all of which count, where there are enough
-    rollouts.
+    asks the planner once for each branch; else in trees of a few branches, which all count, given enough rollouts.
     """
     kind: Search = "tree" if config.branches or config.trees > 1 else "none"
     compiled: Compile = "no" if config.compile == "auto" else config.compile

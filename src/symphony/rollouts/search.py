@@ -139,9 +139,7 @@ def with_drawn_goals(
 
 
 def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
-    """Return numbers [*b, P] for the rule from a start state [*b, S]: those of the tree's first branch, told apart
-    from its actions'.
-    """
+    """Return numbers [*b, P] for the rule from a start [*b, S]: the first branch's, told apart from its actions'."""
 
     def noise(start: TensorDictBase, periods: int) -> Float[Tensor, "*b P"]:
         root = start.get(keys.STREAM)[..., 0, :]
@@ -159,8 +157,7 @@ def collector_settings(
     rule: PruningRule,
 ) -> dict[str, Any]:
     """Return settings that a collector of driving needs beside environment, policy and scores: trees of ``segments``
-    run segments at a time, which a ``rule`` prunes, and random numbers that depend on nothing but seed, segment,
-    branch and step.
+    run segments at a time, which a ``rule`` prunes, and random numbers of seed, segment, branch and step alone.
     """
     return {
         "branches": config.branches,

@@ -124,9 +124,7 @@ def undisturbed(agent: Agent, device: torch.device) -> Iterator[None]:
 
 
 class Previewer:
-    """Simulates an agent as it will be used, on the same run segments of a data set at each call, and shows it in the
-    run's folder ``media``.
-    """
+    """Simulates an agent as it will be used, on the same run segments each time, and shows it in folder ``media``."""
 
     def __init__(
         self,
@@ -145,9 +143,7 @@ class Previewer:
         self.how = EvaluateConfig(rollouts=rollouts, device=str(device))
 
     def __call__(self, step: int, tracker: Tracker | None = None) -> dict[str, float]:
-        """Show the agent as it is after an update, in the folder and to a tracker; return :func:`quantiles` for the
-        record, and raise DataError if the disk refuses.
-        """
+        """Show the agent in folder and tracker; return :func:`quantiles`. Raises DataError if the disk refuses."""
         segments, scenes = [self.dataset.segment(i) for i in self.items], self.dataset.scenes(self.items)
         with undisturbed(self.agent, self.device):
             rollouts = simulate_batch(self.agent, scenes.to(self.device), self.how).rollouts.cpu()

@@ -46,8 +46,7 @@ def wosac_window(segment: RunSegment, future: int = FUTURE) -> RunSegment:
     first logged one at its velocity, so that there is no jump in speed. Where the world's origin is more than 100 km
     away, as in maps with UTM coordinates, that of the segment takes its place.
 
-    With fewer than 80 steps of the future all of this is shorter by as much. Raises a :class:`DataError` for less
-    than 8 s.
+    With fewer than 80 steps of the future all of this is shorter by as much. Raises :class:`DataError` below 8 s.
     """
     tenth = segment if abs(segment.dt - DT) < 1e-6 else resample(segment, DT)
     steps = min(tenth.num_steps, CURRENT + 1 + future)
@@ -169,9 +168,7 @@ and vehicles that act at random."""
 
 
 class SegmentResult(NamedTuple):
-    """The result of an agent on a run segment: its scores (see :func:`symphony.wosac.scorer.score`), its passing
-    gaps, and CPU seconds of the simulation.
-    """
+    """An agent on a run segment: its scores (:func:`.scorer.score`), passing gaps and CPU seconds of simulation."""
 
     scores: dict[str, float]
     passing: PassingGaps

@@ -55,9 +55,7 @@ class ScoreFile:
     strict: bool
 
     def __call__(self, packed: Packed) -> dict[str, Any] | Skip:
-        """Return ``scenario_id``, the :func:`symphony.wosac.scorer.score`, and ``objects`` where asked for; or why
-        there is no score.
-        """
+        """Return ``scenario_id``, the :func:`.scorer.score` and ``objects`` if wanted; or why there is no score."""
         file, record, payload, rollouts = packed
         parsed, config = parse_scenario(payload, file, record), scorer.CHALLENGES[self.config]
         name = parsed.scenario_id

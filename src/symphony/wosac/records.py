@@ -29,8 +29,7 @@ _POINT = attrgetter("x", "y", "z")
 
 def read_scenarios(path: Path) -> Iterator[tuple[Path, int, bytes]]:
     """Yield (file, number of the record in it, payload) of every record of the scenario files meant by a file, a
-    folder (searched) or a pattern with ``*``. Raises a :class:`DataError` where there are none, or a file or record
-    is damaged; names it.
+    folder (searched) or a pattern with ``*``. A :class:`DataError` says if there are none, or names what is damaged.
     """
     if path.is_dir():
         files = sorted({file for pattern in WomdReader.patterns for file in path.rglob(pattern)})

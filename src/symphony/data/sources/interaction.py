@@ -193,9 +193,7 @@ class InteractionReader(Reader):
 
 
 def _observed(rows: Rows, begin: int, stop: int) -> tuple[int, int]:
-    """Return the window itself, or where no vehicle that moves is seen throughout, the longest time for which one is,
-    if that is at least half of the window.
-    """
+    """Return the window, or its longest part, at least half of it, in which one vehicle that moves is always seen."""
     times, step = np.unique(rows.time, return_inverse=True)  # at others the frame may be lost
     best = times[:0]
     for track in np.unique(rows.track[rows.kind == AgentType.VEHICLE]):

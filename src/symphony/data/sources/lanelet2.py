@@ -376,8 +376,7 @@ def utm(places: Doubles, origin: Doubles) -> Doubles:
     """Project by Universal Transverse Mercator on WGS 84, in the zone of the origin, relative to the origin.
 
     Lanelet2's and INTERACTION's usual projection (there about latitude and longitude 0). Krüger's series to the
-    fourth order in the third flattening (Karney, 2011, arXiv:1002.1417, eq. 35): well below a millimetre inside a
-    zone.
+    fourth order in the third flattening (Karney, 2011, arXiv:1002.1417, eq. 35): well below 1 mm inside a zone.
 
     Takes places [N, 2] and an origin [2] of latitude and longitude in degrees, and gives [N, 2] metres, x towards the
     grid's east, y towards its north. Latitudes beyond 84 degrees are a :class:`DataError`.

@@ -61,9 +61,7 @@ class Lanes:
         return torch.where(self.squared == 0, 0.0, dot / torch.where(self.squared == 0, 1.0, self.squared))
 
     def compared(self, points: Float[Tensor, "M 2"]) -> Float[Tensor, " M"]:
-        """Return the official scorer's distance of a point to each of M segments: ``|away + t along|``, where the
-        true distance is ``|away - t along|``.
-        """
+        """Return the official distance [M] of points to segments: ``|away + t along|``, where ``-`` would be true."""
         x, y = (points - self.start + self.share(points).clamp(0, 1)[:, None] * self.along).unbind(-1)
         return (x * x + y * y).sqrt()
 

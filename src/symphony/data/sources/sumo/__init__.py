@@ -41,10 +41,9 @@ def generate_run(
 ) -> tuple[list[RunSegment], Counter[str]]:
     """Make one network, simulate its traffic once and cut run segments at 5 Hz out of it.
 
-    Gives the segments, and how many windows gave none for which reason.
-    The light of a movement is attached to the connector lane inside the junction, which only that movement
-    takes; its stop point is the end of the lane before. Equal arguments give equal segments. Segments of one focus
-    share one map object.
+    Gives the segments, and how many windows gave none for which reason. The light of a movement is attached to the
+    connector lane inside the junction, which only that takes; its stop point is the end of the lane before. Equal
+    arguments give equal segments. Segments of one focus share one map object.
 
     A kind is one of :data:`KINDS`, or a file of your own roads (:data:`.networks.OWN_ROADS`); another seed is
     another network. ``duration`` is what is recorded, in seconds, after a warm-up. ``rule`` says how maps and egos
