@@ -71,8 +71,7 @@ MEASURES: dict[str, Measure] = {
 class Estimate:
     """The mean over the runs that have a number, None if none has, and the groups of their segments.
 
-    With the given confidence the mean is not below ``low``, and with the same confidence not above ``high``; None
-    where that is not known.
+    With this confidence each, the mean is not below ``low`` and not above ``high``; None where that is unknown.
     """
 
     mean: float | None
@@ -116,9 +115,8 @@ def measured(runs: Sequence[Run], measure: Measure, confidence: float = 0.95) ->
 def _rate_bound(value: NDArray[np.float64], group: NDArray[np.int64], groups: int, confidence: float) -> float:
     """Return the upper bound of a rate from 0 to 1 (Korn and Graubard).
 
-    The scatter between groups is taken with one more group in which it always happened: of a rare event that some
-    groups have throughout, few groups alone show too little scatter (in simulations the bound then held in 88 % of
-    cases, not in 95 %).
+    The scatter is taken with one more group in which it always happened: few groups alone show too little for a rare
+    event that some have throughout (in simulations the bound then held in 88 % of cases, not in 95 %).
     """
     rate, runs = float(value.mean()), len(value)
     if rate in (0.0, 1.0) or groups < 2:

@@ -36,9 +36,8 @@ _OBJECT_HIT = 0.5
 
 
 class PDM(NamedTuple):
-    """Terms of the score, each from 0 to 1: no collision at fault (half for one with an object), the whole box within
-    the drivable area, enough time to a collision at every step, all limits of comfort kept, and progress relative to
-    the log's.
+    """Terms of the score, each from 0 to 1: no collision at fault (half for one with an object), the box within the
+    drivable area, enough time to collision at every step, all limits of comfort kept, progress relative to the log's.
     """
 
     no_collision: float

@@ -2,9 +2,8 @@
 
 Heights alone do not tell: a car 60 m up a steep street is as high as one on a bridge. Where the lines of a map lie
 above each other they are counted from below, and each number spreads along the surface it is on, up to where it meets
-another. Two places are on different levels if their numbers differ, and their heights by
-:data:`LEVEL`: so cars that follow each other up a ramp are never apart. Places that no such surface
-reaches have no level and see all others.
+another. Two places are on different levels if their numbers differ, and their heights by :data:`LEVEL`: so cars that
+follow each other up a ramp are never apart. Places that no such surface reaches have no level and see all others.
 """
 
 from __future__ import annotations

@@ -9,8 +9,7 @@ A store is a directory::
     report.json     what the conversion skipped, and why
     store.lock      held by the writer
 
-Columns that have one row per agent, say, share an *axis*; a record holds the first row and the number of rows
-on each axis. Nothing is padded.
+Columns with one row per agent, say, share an *axis*; records hold first row and number of each. Nothing is padded.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""Models of an agent's motion: kinematic bicycle with discrete actions, and continuous displacement; and policies
-that need no learning.
+"""Models of an agent's motion, discrete bicycle and continuous displacement, and policies that need no learning.
 
 State: x, y, heading, speed of the box centre (metres, radians, m/s). Everything is differentiable and out of
 place. Shapes: ``...`` any batch, T steps.
@@ -233,8 +232,7 @@ def _follow(
 ) -> tuple[Shaped[Tensor, "*_"], Float[Tensor, "*b T 4"]]:
     """Step through a log: ``advance(state, target, known)`` gives an action and the state it leads to.
 
-    ``known`` says where the target and the logged state before it are valid. Where a log begins again after a
-    gap, so does the state.
+    ``known`` says where the target and the logged state before it are valid. After a gap in the log it starts anew.
     """
     time, state = log.ndim - 2, log[..., 0, :]
     states, actions = [state], []

@@ -171,9 +171,8 @@ def entering(
     """Return which of the ready agents can enter, far enough from all others: farther where they come ``late``, past
     the log, where no log shows that it went well.
 
-    Of several that are ready at once the earlier slot goes first: a later one is kept away from where it is, even if
-    that one can't enter either. Those that are ready stand among ``objects`` where they enter; ``index`` are the rows
-    of A of the driven agents.
+    Of several that are ready the earlier slot goes first: a later one keeps away from it, even if that can't enter.
+    Those that are ready stand among ``objects`` where they enter; ``index`` are the driven agents' rows of A.
     """
     agents = objects.valid.shape[1]
     slot = torch.arange(index.shape[1], device=index.device).expand(index.shape)

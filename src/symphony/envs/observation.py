@@ -1,7 +1,6 @@
 """The observation of an agent (paper, section IV-C): the nearest objects, map points and lights, in its own frame.
 
-Shapes: M rows (any flattened batch), N observing agents, A agents of the scene, O objects, P points of a scene,
-K points that each observes.
+Shapes: M rows (any flattened batch), N observing agents, A agents, O objects, P points of a scene, K points seen.
 """
 
 from __future__ import annotations

@@ -72,8 +72,7 @@ class MapEdge(NamedTuple):
 def map_edge(graph: LaneGraph) -> MapEdge:
     """Return where the map of a lane graph ends.
 
-    A lane goes nowhere if neither it nor a lane beside it has a successor: one that ends beside others, as on a ramp,
-    is left by a lane change.
+    A lane goes nowhere if neither it nor a lane beside it has a successor: an on-ramp is left by a lane change.
     """
     exits = []
     for lane in graph.usable_lanes.tolist():

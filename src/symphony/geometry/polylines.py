@@ -233,8 +233,7 @@ def stations_along(
     A path begins at the earliest place that is nearest to it, or nearly so, and goes on from there: a step leads at
     most as far along the line as was driven, and some metres.
 
-    Shorter lines end with their last point again. Raises ValueError where a point that exists is not finite; names
-    line and step.
+    Shorter lines repeat their last point. A ValueError names line and step where a point that exists is not finite.
     """
     wrong = np.argwhere(valid & ~np.isfinite(path).all(-1))
     if len(wrong):

@@ -42,8 +42,7 @@ class SearchReplay:
 
     Where the collector has the rows of K searches, these are made together, at every update that K x `every` divides,
     by the networks of that update, and updates learn from one after the other: with the k-th of them (from 0) from
-    states that are k x `every` to (k + 1) x `every` - 1 updates old. K = 1 learns from the same states as a search
-    that is made when it is needed.
+    states that are k x `every` to (k + 1) x `every` - 1 updates old. K = 1 learns as from searches made when needed.
 
     Not one of TorchRL's replay buffers: a state names a row of the scenes that its search drew, so it ends with them,
     and what networks observe is made only for the states drawn.
@@ -140,8 +139,7 @@ class SearchReplay:
     def both_kinds(self, rng: torch.Generator) -> TensorDict:
         """Return simulated states, pruned ones included, and logged states of the same scenes.
 
-        The log is taken as fitted to the action space, so that its noise does not give it away; its agents follow the
-        routes they took.
+        The log is fitted to the action space, lest its noise give it away; its agents follow the routes they took.
 
         Args:
             rng: the generator of the draw.

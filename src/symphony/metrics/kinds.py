@@ -88,8 +88,7 @@ def collision_kinds(
 
     The other one is the valid agent whose box meets the agent's first within that step; of several at once the one
     that reaches deepest into it at its end. The states one step before and those at the time of contact decide the
-    kind, because after the step fast boxes lie far inside each other, or beyond; where the other is not valid before,
-    those after it.
+    kind, as after the step fast boxes lie deep in each other or beyond; those after it if the other was not valid.
 
     Takes whether an agent collides in a step (see :func:`symphony.metrics.collisions`); x, y, heading and speed of
     the interactive agents, whether they are there, and their rows of A, where a negative one stands for no agent;

@@ -77,8 +77,7 @@ def log_area(share: Pairs, pace: Reals, slope: Reals, reach: float) -> Reals:
 class BoundedDisplacement(Distribution):
     """Displacements [..., 2] (metres; forward, left) reachable within a step, see :func:`displaced`.
 
-    Their shares of what can be reached are those of Gaussian numbers u, squashed; differentiable in u, in the
-    parameters and in the bounds.
+    Their shares of what can be reached are Gaussian numbers u, squashed; differentiable in u, parameters and bounds.
 
     ``loc`` and ``scale`` are mean and standard deviation of u; the others are as :func:`displaced` has them.
     """

@@ -161,9 +161,8 @@ def displacement_policy(
     them where there is one (see :class:`NoiseSampler`).
 
     `own_features` counts those under all `own_keys`; the second of the first key is the box length, of which
-    `size_scale` metres count as 1. `cells` are the numbers of cells along and across, 0 for a Gaussian; `dt` are
-    seconds per step. Of `state_key` `[..., N, 4]` the speed is read. Another `encoder` takes the arguments of
-    :class:`SceneEncoder`.
+    `size_scale` metres count as 1. `cells` are numbers of cells along and across, 0 for a Gaussian; `dt` are seconds
+    per step. Of `state_key` `[..., N, 4]` the speed is read. An `encoder` takes what :class:`SceneEncoder` does.
     """
     if cells and (cells < 3 or cells % 2 == 0):
         raise ValueError(f"cells must be odd and at least 3, or 0 for none, is {cells}")

@@ -44,8 +44,7 @@ POINTS = 20  # of a trajectory that are kept, at most
 
 class PlannedEnv(DrivingEnv):
     """A driving environment with states besides actions: background agents go where ``BACKGROUND`` says, and the
-    first P interactive agents, the ego and others with planners, where ``PLANNED`` says; without such an entry they
-    act like the others.
+    first P interactive agents, the ego and others with planners, where ``PLANNED`` says, else like the others.
     """
 
     def _moved(self, tensordict: TensorDictBase, state: Tensor, size: Tensor) -> Tensor:

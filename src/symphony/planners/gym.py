@@ -40,8 +40,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
     Observations are what :class:`symphony.envs.driving.DrivingEnv` shows an agent, in its own frame: ``own``,
     ``objects`` and ``points`` with their masks, ``route`` where asked for (the one the log took). The rest is in
     ``info``: ``segment`` (its id), ``step``, ``state`` (x, y in metres, heading in radians, speed in m/s),
-    ``collision``, ``offroad``, and ``driven``, metres since the step before. :meth:`seen` returns what a planner
-    would be told.
+    ``collision``, ``offroad``, and ``driven``, metres since the step before. :meth:`seen` is what a planner is told.
 
     Args:
         data: a store of run segments, or its folder.

@@ -1,7 +1,6 @@
 """The view of a planner in one record: for planners that are plain functions, and for those in other processes.
 
-World frame of the run segment, metres, seconds, m/s, radians counter-clockwise. Legend: M others that are present, K
-points, Q lights.
+World frame of the segment, metres, seconds, m/s, radians counter-clockwise. M others present, K points, Q lights.
 """
 
 from __future__ import annotations

@@ -93,8 +93,7 @@ BIKE_LANE = 3  # the lane type that vehicles keep off (see ``LaneType``)
 class Regions:
     """Branching regions: the alternatives at each place where a lane has more than one successor.
 
-    Two regions with the same parent are alternatives of one choice. A lane with several branching predecessors
-    is a region once for each of them.
+    Two regions with one parent are alternatives of a choice. A lane is a region once for each branching predecessor.
     """
 
     lane: Indices  # [R] the lane that is the region

@@ -85,8 +85,7 @@ def at(line: Reals, arc: Reals, places: Reals) -> Reals:
 def followed(graph: LaneGraph, before: int, lane: int) -> Reals:
     """Return the centre line of a lane as followed from the end of the lane before, without that end itself.
 
-    It is the lane's own line where the two meet. Where they do not, what overlaps is left out, and what lies aside is
-    made up for by a short blend.
+    It is the lane's own line where the two meet. Else overlap is left out, and a short blend makes up for the rest.
     """
     known = graph.followed.get((before, lane))
     if known is None:

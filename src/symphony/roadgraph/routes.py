@@ -260,8 +260,7 @@ def route_lines(
 
 
 def carried_on(graph: LaneGraph, line: Reals, length: float, speed: float = 0.0) -> Reals | None:
-    """A line [P, 2] that ends with a lane beside others which go on, carried on up to a length in metres; None for
-    another line.
+    """Return a line [P, 2] that ends beside lanes that go on, carried on up to a length in metres; None for others.
 
     On that lane, :func:`change_length` or :data:`CHANGE_METRES` before its end, it changes to the nearest of those,
     and follows the straightest lanes from there, again and again where these end beside others, too.

@@ -57,8 +57,7 @@ class Crowd:
         """Return rows of A: those that the agent drives, the ego first, and background agents.
 
         Those present at the first step come in the order of :func:`symphony.data.selection.interactive_choice`, then
-        those that stand in a lane, by their distance; in open traffic then those that come later, by their time and
-        then by their distance.
+        those that stand in a lane, by their distance; in open traffic then later ones, by time, then distance.
 
         Raises:
             DataError: the ego or one of those is not seen at the first step, or in open traffic never within the map.

@@ -77,8 +77,7 @@ def draw_goals(
     """Return the route [..., N] that the goal policy draws for each agent from a start state, -1 for none; ``tree``
     is the number of the draw within its scene.
 
-    In open traffic, agents that enter later draw as if all were present already; past the log, where that is unknown,
-    as if alone.
+    In open traffic, later agents draw as if all were there already; past the log, where that is unknown, as if alone.
     """
     noise = _drawn(env, start.get(keys.SCENE), seed, Stream.GOALS, tree)
 

@@ -97,9 +97,8 @@ def score_files(
     of the challenge. With ``per_object`` the scores of each object are included; where ``strict``, a scenario that
     can't be scored is an error. ``progress`` is called with the scenarios done and, where known, all there are.
 
-    Returns the mean over scenarios, every scenario's own scores and what was left out, as JSON can hold it; and what
-    was left out. Raises a :class:`DataError` where rollouts don't fit, or no scenario can be scored, that names file,
-    scenario, agent and field.
+    Returns the mean over scenarios, their own scores and what was left out, for JSON; and what was left out. A
+    :class:`DataError` names file, scenario, agent and field where rollouts don't fit, or no scenario can be scored.
     """
     total = len(list(rollouts.glob("*.npz"))) if rollouts.is_dir() else 1
     results: list[dict[str, Any]] = []

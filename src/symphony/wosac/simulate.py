@@ -5,8 +5,7 @@ latest state seen up to then. The learned agent drives all vehicles, however few
 edge of the map, past which they keep their velocity. Those that stand stay, and people walk on; driven vehicles see
 the latter at constant velocity.
 
-Legend: A agents, n of them valid at the current step, N vehicles among these, R rollouts, F future steps (80), U
-decisions and the first state.
+Legend: A agents, n valid at the current step, N vehicles of them, R rollouts, F future steps (80), U decisions + 1.
 """
 
 from __future__ import annotations

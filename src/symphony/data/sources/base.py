@@ -221,10 +221,9 @@ def pairs(links: list[tuple[int, int]]) -> NDArray[np.int32]:
 def time_step(times: Doubles, field: str) -> float:
     """Return the seconds between steps that begin at ``times`` [T], T at least 2.
 
-    They are rounded to the millisecond where that fits the log: at 15 or 30 Hz it would run up to a percent too fast
-    or slow. Where steps are off by more than a tenth it is the usual one, to which
-    :func:`symphony.data.resample.evened` brings the log. A :class:`DataError` says if more than a third of the steps
-    differ from it, or half of them are missing.
+    They are rounded to the millisecond where that fits the log: at 15 or 30 Hz it would be up to a percent off. Where
+    steps are off by more than a tenth it is the usual one, to which :func:`symphony.data.resample.evened` brings the
+    log. A :class:`DataError` says if more than a third of the steps differ from it, or half of them are missing.
     """
     gaps = np.diff(times)
     mean = float(gaps.mean())

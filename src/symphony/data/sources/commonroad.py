@@ -300,8 +300,7 @@ def _shape(parts: list[ET.Element], field: str) -> Box:
 class _Lanelet:
     """A lanelet: its lane, halfway between its bounds [P, 2], its types, and what else it says.
 
-    ``marked`` are the bounds that are painted, ``lights`` ids of traffic lights, ``stop`` [2] is where its stop line
-    is, or where it ends.
+    ``marked`` are painted bounds, ``lights`` ids of traffic lights, ``stop`` [2] is its stop line, or where it ends.
     """
 
     lane: Lane

@@ -65,8 +65,7 @@ class Rows:
 def read_rows(path: Path) -> Rows:
     """Read a track file.
 
-    A :class:`DataError` names file and line where it is too large, empty or cut short, or a column is missing, or a
-    field can't be read.
+    A :class:`DataError` names file and line if it is too large, empty or cut short, or lacks a column or valid field.
     """
     size = path.stat().st_size
     refuse(size > MAX_BYTES, f"{size} bytes, at most {MAX_BYTES} can be read", file=path)

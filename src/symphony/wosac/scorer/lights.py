@@ -101,9 +101,8 @@ def red_light_violations(
 ) -> Bool[Tensor, "*batch T"]:
     """Return at which steps a box's centre passes the stop point of a red signal while its lane is the signal's.
 
-    The lane of a box is that of its nearest segment (see :meth:`Lanes.nearest`) at the step. Passing means to be
-    before the stop point, along the signal lane's segment nearest to it, at the step before, and beyond it at the
-    step itself.
+    The lane of a box is that of its nearest segment (see :meth:`Lanes.nearest`) at the step. Passing is to be before
+    the stop point, along the signal lane's segment nearest to it, a step before, and beyond it now.
     """
     result = torch.zeros_like(valid)
     seen = torch.isin(signals.lane, lanes.lane) & signals.red.any(-1)

@@ -40,11 +40,9 @@ def score(
     likelihood (``NAME_likelihood``, 0 to 1); the weighted means of the groups of components (``kinematic_metrics``,
     ``interactive_metrics``, ``map_based_metrics``); metres from the log with the history, as the mean over rollouts
     and objects (``average_displacement_error``) and of the best rollout (``min_ade``); shares of rollouts and objects
-    that collide, leave the road or run a red light at a step at which the log is valid (``simulated_collision_rate``
-    and so on).
+    that collide, leave the road or run a red light at a step with a valid log (``simulated_collision_rate`` etc.).
 
-    Raises a :class:`DataError` where the two don't fit together, or there is nothing to score a component with; names
-    scenario, field and agent.
+    A :class:`DataError` names scenario, field and agent where the two don't fit, or a component can't be scored.
     """
     try:
         return score_features(compute_features(scenario, rollouts), config)
