@@ -99,8 +99,7 @@ class Suite:
 
     Attributes:
         items: the rows of the store that are driven, in the order in which they are.
-        baseline: a planner of the suite that others are compared with, or the ``result.json`` of an earlier run of
-            it; empty for none.
+        baseline: a planner of the suite that others are compared with, or an earlier ``result.json`` of it; or empty.
     """
 
     name: str

@@ -151,8 +151,7 @@ def beam_search(
         keep: entries kept of each step, e.g. ``[("next", "agents", "state")]``; default all.
         keep_tree: also return the branches that were pruned.
         leaves: how many to return, the best by their `leaf_costs` first; default all, in the order of their slots.
-        compile_step: compile policy, environment and score of a step as one program, or how, as
-            :func:`torch.compile` takes it.
+        compile_step: compile policy, environment and score as one program, or how, as in :func:`torch.compile`.
         exploration_type: the exploration type under which the policy runs.
 
     Raises:

@@ -112,8 +112,7 @@ def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> E
     Args:
         env: an environment with rows [*b], or for any batch shape.
         shape: the batch shape of the states, [*b, S].
-        share: what its transforms learn, such as the statistics of VecNorm, is one with the environment's; else it is
-            a copy of its own, and frozen.
+        share: what its transforms learn, as VecNorm's statistics, is one with the environment's; else frozen copies.
     """
     base, transforms = parts_of(env)
     _check_shape(base, torch.Size(shape))

@@ -31,8 +31,7 @@ class Aggregate:
 
     Args:
         time: how the T_p steps are joined, those before the end of an episode alone.
-        agents: how the N agents are joined. Scores of padded agents are 0: a sum does not change with how many there
-            are, a maximum or a mean does.
+        agents: how the N agents are joined. Scores of padded agents are 0, which only a sum ignores.
     """
 
     time: Literal["max", "mean", "sum", "last"] = "max"

@@ -435,7 +435,8 @@ def merge(paths: Sequence[Path], out: Path, progress: Told | None = None) -> Seg
         raise DataError("exists already; choose another folder", file=out)
     stores = [SegmentStore(path) for path in paths]
     for store in stores:
-        store.check_complete()
+        if store.unfinished is not None:
+            raise DataError(store.unfinished, file=store.path)
     steps = {float(dt) for store in stores for dt in store.time_steps}
     if len(steps) > 1:
         listed = ", ".join(f"{dt:g} s" for dt in sorted(steps))

@@ -232,11 +232,6 @@ class SegmentStore(Sequence[RunSegment]):
         held = f"holds {len(self)} of {settings.get('segments', 'more')} segments: its generation is not finished"
         return f"{held}; give the same `symphony data generate` again"
 
-    def check_complete(self) -> None:
-        """Refuse a store that is still being generated, or whose generation was interrupted."""
-        if self.unfinished is not None:
-            raise DataError(self.unfinished, file=self.path)
-
     def checksum(self) -> str:
         """Return SHA-256 over the hashes in the index, sorted by segment id: the same for the same segments.
 

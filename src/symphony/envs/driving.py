@@ -226,8 +226,7 @@ class DrivingEnv(EnvBase):
         """Return the state at the first logged step, as :meth:`reset` returns it.
 
         The shape of ``scene``, rows of the scene batch, is the batch size. The number of a ``rollout`` (branch,
-        repetition) within its scene lets each draw its own numbers, whatever batch it runs in. Goals are the routes
-        that agents follow; by default none.
+        repetition) in its scene lets each draw its own in any batch. Goals are routes to follow; by default none.
         """
         rollout = torch.as_tensor(rollout, device=scene.device).expand(scene.shape)
         stream = fold_in(self.scenes.stream[scene], rollout)

@@ -98,8 +98,7 @@ class Bicycle:
     """Kinematic bicycle with a grid of discrete actions (paper, section V-A: 7 accelerations x 21 steering angles).
 
     The joint index of an action is ``acceleration_index * num_steering + steering_index``. Both grids are spaced
-    quadratically, dense near coasting straight ahead: on real logs the greedy fit then swings least between
-    neighbouring actions, for the same error.
+    quadratically, dense near coasting straight ahead: on real logs the greedy fit swings least, at equal error.
 
     Raises a :class:`ConfigError` for a grid of another size.
     """

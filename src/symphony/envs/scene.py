@@ -444,9 +444,7 @@ class Tables:
 
     @cached_property
     def light_points(self) -> tuple[Tensor, Tensor]:
-        """Positions [B, Q, 2] of the points that are lights, infinity where a scene has fewer, and their numbers
-        [B, Q] among all points; Q is at least 1.
-        """
+        """Positions [B, Q, 2] of lights, infinity where a scene has fewer, and numbers [B, Q] among points; Q > 0."""
         scenes = self.scenes
         is_light = (scenes.point_light >= 0) & scenes.point_valid
         # A light is one point; lights come first, each kind in the order of the scene.

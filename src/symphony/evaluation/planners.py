@@ -153,8 +153,7 @@ def winners(records: Sequence[Record]) -> list[str]:
     """Say for each crowd which planner scores best, and by how much over the next one.
 
     The difference is paired over the runs of the segments that both drove (± standard error over groups); whether 0
-    is outside of its 95 % interval is by Student's t. Of two that drove different segments, the better is the one
-    that did better where both drove.
+    is outside of its 95 % interval is by Student's t. The better of two is the one that did better where both drove.
     """
     found = []
     for crowd, members in _crowds(records).items():

@@ -50,11 +50,6 @@ def gap_features(gap: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3"]:
     return torch.stack([(gap / 0.5).tanh(), (gap / 3.0).tanh(), (gap / 10.0).tanh()], -1)
 
 
-def road_features(distance: Float[Tensor, "*b points"]) -> Float[Tensor, "*b features"]:
-    """Return signed distances to the edge of the road in metres as numbers of order one, two for each."""
-    return torch.cat([(distance / 0.5).tanh(), (distance / 3.0).tanh()], -1)
-
-
 EncoderClass = Callable[..., Any]
 """Called with the arguments of :class:`SceneEncoder`; returns a module that is called like it, with a `width`."""
 

@@ -65,7 +65,7 @@ class Discriminator(nn.Module):
         objects_mask = objects_mask & self._near(objects)
         points_mask = points_mask & self._near(points)
         if road is not None and self.clearance:
-            own = torch.cat([own, encoder.road_features(road)], -1)
+            own = torch.cat([own, (road / 0.5).tanh(), (road / 3.0).tanh()], -1)  # two numbers of order one for each
             known = [encoder.gap_features(gap).flatten(objects.ndim - 1) for gap in gaps]
             objects = torch.cat([objects, *known], -1)
         logits = self.network(own, valid, objects, objects_mask, points, points_mask)

@@ -151,8 +151,7 @@ class ActorLoss(MaskedLoss):
     Args:
         actor_network: probabilistic module with a `get_dist`.
         reduction: see :class:`MaskedLoss`.
-        label_smoothing: share of the target spread evenly over all possible categories, in [0, 1); categorical actors
-            only.
+        label_smoothing: share of the target spread evenly over all categories, in [0, 1); categorical actors only.
         use_mask: see :class:`MaskedLoss`.
     """
 

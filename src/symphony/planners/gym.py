@@ -47,8 +47,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         action: ``discrete``: the kinematic bicycle's joint actions; ``continuous``: the displacement over a step,
             forward and to the left, where 1 stands for :data:`TOP_SPEED`.
         observation: what the ego observes.
-        reward: reward of a step, from the state before and the state after it, as for ``DrivingEnv``; by default -1
-            where the ego collides or is off the road.
+        reward: of a step, by states before and after it, as for ``DrivingEnv``; default -1 in collision or off road.
         ends_on: what ends an episode early.
         duration: seconds of each segment that are driven; 0 for all.
 

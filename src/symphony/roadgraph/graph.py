@@ -125,8 +125,7 @@ class LaneGraph:
         left: per lane, the lanes a change to the left reaches.
         right: per lane, the lanes a change to the right reaches.
         regions: the branching regions, by parent, then by lane.
-        followed: lines [P, 2] of pairs of a lane and its successor that were sought already, see
-            :func:`symphony.roadgraph.paths.followed`.
+        followed: lines [P, 2] of pairs of a lane and its successor already sought, see :func:`.paths.followed`.
         gentle: results for lanes that were checked already, see :func:`symphony.roadgraph.paths.gentle`.
     """
 

@@ -71,8 +71,7 @@ class SavedRollouts:
         drivers: [N] who drove each agent.
         failed: reason why a rollout broke off, by its number; its later steps don't count.
         trees: the searches, where they are kept.
-        plan: [K, P, T, H, 2] points that the planners of the first P agents meant to pass, NaN for none; None if none
-            ever said.
+        plan: [K, P, T, H, 2] points that the planners of the first P agents meant to pass, NaN for none; or None.
     """
 
     segment: RunSegment

@@ -242,8 +242,7 @@ def _references(values: Any) -> tuple[str, ...]:
 
 
 def _successors(lanes: Sequence[Lane]) -> list[tuple[int, int]]:
-    """Return which lanes go on where: one that begins within :data:`MEETS` of another's end, and turns off by less
-    than :data:`TURN`, succeeds it."""
+    """Return which lanes succeed others: those within :data:`MEETS` of an end, turned by less than :data:`TURN`."""
     starts, ends = (shapely.points(np.array([lane.line[row, :2] for lane in lanes])) for row in (0, -1))
     before, after = shapely.STRtree(starts).query(ends, predicate="dwithin", distance=MEETS)
     out, into = (np.array([_course(lane.line, row) for lane in lanes]) for row in (-1, 0))
