@@ -183,7 +183,7 @@ def quantiles(samples: Samples) -> dict[str, float]:
 
 def samples_of(scenes: SceneBatch, rollouts: Rollouts, dt: Sequence[float]) -> Samples:
     """Return the motion of interactive agents in rollouts [B, K] of scenes with steps of dt seconds: ``speed`` (m/s),
-    ``acceleration`` (m/s^2) and ``turn`` (rad/s) by step, and as logged (``speed_log`` etc.); a segment's ``ade`` (m).
+    ``acceleration`` (m/s^2) and ``turn`` (rad/s) by step, and as logged (``speed_log`` etc.); ``ade`` (m) by segment.
     """
     log, seen = (part[:, None] for part in logged(scenes))
     step = log.new_tensor(dt)[:, None, None, None]
