@@ -310,8 +310,11 @@ def _method_words(spec: AgentSpec) -> str:
     extras = []
     if spec.goals:
         extras.append("routes that a goal policy draws from the first state")
-    if spec.searches:
-        extras.append("a beam search that a discriminator prunes")
+    judge = "a rule" if spec.search.score == "rule" else "a discriminator"
+    if spec.searches and spec.search.way == "backtrack":
+        extras.append(f"rollouts that go back and try again where {judge} finds them bad")
+    elif spec.searches:
+        extras.append(f"a beam search that {judge} prunes")
     return words + (f", with {' and '.join(extras)}." if extras else ".")
 
 

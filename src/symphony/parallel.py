@@ -78,18 +78,34 @@ def get_ready(imports: Sequence[str]) -> None:
 
 
 @contextlib.contextmanager
-def _starting(put_off: Sequence[int] = (signal.SIGINT,)) -> Iterator[None]:
+def _starting() -> Iterator[None]:
     """Give processes started inside the environment of workers; they put off interrupts: the parent's are enough."""
     before = {name: os.environ[name] for name in WORKER_ENVIRONMENT if name in os.environ}
     try:
-        signal.pthread_sigmask(signal.SIG_BLOCK, put_off)
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         os.environ.update(WORKER_ENVIRONMENT)
         yield
     finally:
         for name in WORKER_ENVIRONMENT:
             os.environ.pop(name, None)
         os.environ.update(before)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, put_off)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+@contextlib.contextmanager
+def _put_off() -> Iterator[None]:
+    """Handle signals that come meanwhile, whichever thread gets them, at the end: half a start can't be tidied up."""
+    came: list[int] = []
+    ours = threading.current_thread() is threading.main_thread()  # others get no signals
+    kinds = (signal.SIGINT, signal.SIGTERM) if ours else ()
+    before = {kind: signal.signal(kind, lambda number, _: came.append(number)) for kind in kinds}
+    try:
+        yield
+    finally:
+        for kind, handler in before.items():
+            signal.signal(kind, handler)
+        for number in came:
+            signal.raise_signal(number)
 
 
 def _ahead(submit: Callable[[T], Any], tasks: Iterator[T], count: int) -> Iterator[deque[Any]]:
@@ -109,7 +125,7 @@ def _local_map(function: Callable[[T], R], tasks: Iterator[T], workers: int, nam
     pool = ProcessPoolExecutor(workers, context, _begin_worker, (lifeline, environment))
 
     def submit(task: T) -> Any:
-        with _starting((signal.SIGINT, signal.SIGTERM)):  # started as they are needed; half a start is not tidied up
+        with _put_off(), _starting():  # processes are started here, as they are needed
             return pool.submit(function, task)
 
     pending, done = deque[Any](), 0
