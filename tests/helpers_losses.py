@@ -90,7 +90,6 @@ def main() -> None:
         batch = batch_of(env, env.start(row, row))
         out = losses(agent, env)[name](batch.exclude(keys.ACTION) if name == "mgail" else batch)
         total = sum(value for key, value in out.items() if key.startswith("loss"))
-        assert isinstance(total, torch.Tensor)
         total.backward()
         if total.isfinite():
             print(name, space)  # noqa: T201

@@ -341,6 +341,16 @@ def test_an_agent_whose_routes_cannot_be_built_has_none(monkeypatch):
     assert scene(segment, [0], LaneGraph(segment.road)).route_logged[0, 0] >= 0
 
 
+@pytest.mark.parametrize("steps", [1, 2, 21])
+def test_who_has_not_changed_lanes_took_no_route_that_does(steps):
+    """Nor who is hardly seen, though more routes change lanes than do not."""
+    segment = straight_road(2, num_lanes=3, steps=21)
+    table = route_table(segment.replace(valid=segment.valid & (np.arange(21) < steps)), LaneGraph(segment.road), 0)
+    aside = np.array([np.ptp(table.line(g)[:, 1]) for g in range(len(table.count))])
+    assert aside.max() > 3
+    assert aside[table.right].max() < 0.1
+
+
 def test_who_drives_under_a_bridge_has_no_route_over_it():
     segment = straight_road(2, num_lanes=1, steps=21)
     lane = segment.road.lanes[0]

@@ -209,7 +209,6 @@ def test_weights_and_biases_gets_video_and_histograms(store: Path, tmp_path: Pat
     assert found[4].keys() - found[2].keys() == {"preview/score_simulated", "preview/score_data"}
     for step, values in found.items():
         video = values.pop("preview/rollout")
-        assert isinstance(video, wandb.Video)
         assert video._path == str(run / "media" / f"rollout-{step:06d}.gif")
         assert all(isinstance(value, wandb.Histogram) and sum(value.histogram) for value in values.values())
 

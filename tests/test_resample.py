@@ -289,7 +289,6 @@ class Lame(FakeReader):
 
     def _read(self, path: Path) -> Iterator[Item]:
         for number, item in enumerate(super()._read(path)):
-            assert isinstance(item, RunSegment)
             size = item.size.copy()
             size[-1, 0] = 0 if number in {1, 2} else size[-1, 0]
             yield hide(item, 0, slice(0, 2)) if number == 3 else replace(item, size=size)

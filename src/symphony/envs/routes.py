@@ -98,7 +98,7 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
     horizon, length = max(HORIZON, drivable(segment, segment.log_steps)), max(HORIZON, reach + ONWARD)
     found = routes(graph, starts, horizon=horizon, onward=max(reach + ONWARD - horizon, 0.0))
     try:
-        lines = route_lines(graph, found, dict(starts), spacing=SPACING, length=length, speed=speed)[1]
+        found, lines = route_lines(graph, found, dict(starts), spacing=SPACING, length=length, speed=speed)
         if not all(np.isfinite(line).all() for line in lines):
             raise ValueError("points that are not finite")
     except (ValueError, IndexError, ArithmeticError) as error:
@@ -111,7 +111,9 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
     path, there = segment.position[agent, first:, :2], segment.valid[agent, first:]
     if segment.goal is not None and agent == segment.ego:
         path, there = np.concatenate([path, [segment.goal]]), np.append(there, True)
-    right = ground_truth_routes(lines, path, there)
+    right, plain = ground_truth_routes(lines, path, there), np.array([route.change == 0 for route in found])
+    # Who hardly moved may be about to change lanes, but rarely is, though more routes change lanes than do not.
+    right &= plain | ~(right & plain).any()
     tied = np.flatnonzero(right)
     draw = stream_of(f"route {segment.segment_id} {segment.agent_id[agent]}") % len(tied)
     count = np.array([len(line) for line in lines], np.int64)

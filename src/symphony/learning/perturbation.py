@@ -89,8 +89,7 @@ def perturbed(
     share: float,
     rng: torch.Generator,
 ) -> tuple[Float[Tensor, "M 4"], Tensor]:
-    """Return expert states and actions, a share of them displaced and labelled with the action that comes nearest to
-    the way back.
+    """Return expert states and actions, a share of them displaced and labelled with actions nearest to a way back.
 
     Args:
         state: x, y, heading, speed of the fitted experts.

@@ -55,8 +55,7 @@ def starting_lanes(
 
     These are lanes within a tolerance in metres, at most :data:`MARGIN` metres farther away than the nearest one. Of
     a lane and its successor only the one that the vehicle is alongside is kept. The lane that :func:`lane_of` names
-    comes first, then by distance. Pairs are (lane, metres from its start). Raises ValueError for a position or a
-    heading that is not finite.
+    comes first, then by distance. Pairs are (lane, metres from its start). A ValueError says what is not finite.
     """
     position = np.asarray(position, dtype=np.float64).reshape(1, 2)
     if not (np.isfinite(position).all() and np.isfinite(heading)):
