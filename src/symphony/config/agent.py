@@ -35,9 +35,9 @@ class AgentConfig(Settings):
     #: route.
     features: Literal["paper", "gaps"] = "paper"
     #: What the goal policy observes of each route. `points`, for older agents: where it is every 12 m; `turns`: also
-    #: where it begins and how much it turns every 3 m, which tells where it changes lanes.
-    goal_features: Annotated[Literal["points", "turns"], Fixed, Suppress] = field(
-        default="turns", metadata={"before": "points"}
+    #: where it begins and how much it turns every 3 m; `changes`: magnified, as changes of lanes are small turns.
+    goal_features: Annotated[Literal["points", "turns", "changes"], Fixed, Suppress] = field(
+        default="changes", metadata={"before": "points"}
     )
     #: Levels of acceleration, an odd number (methods bc*; the paper: 7).
     accelerations: Annotated[int, Bounds(1, 1001)] = 7

@@ -39,6 +39,7 @@ STRIDE = 4  # the goal policy observes every STRIDE-th point of a route
 CHOICE_FEATURES = 5 * (POINTS // STRIDE)
 TURN_FEATURES = 2 + (POINTS - 2)
 """Where a route begins, and a turn at each of its points but the first and the last."""
+MAGNIFIED = 20.0  # times by which sines of turns are observed: those of a change of lanes are a few hundredths
 MOVING, WIDE = 2.0, 6.0
 """Speed (m/s) above which a vehicle on no lane is on one as far away (m) as some cut a corner."""
 ONWARD = 200.0  # metres that routes reach beyond what the fastest agent can drive
@@ -369,13 +370,13 @@ def along_route(
 
 
 def route_choices(
-    state: Float[Tensor, "M N 4"], routes: FollowedRoutes, distance_scale: float, *, turns: bool = False
+    state: Float[Tensor, "M N 4"], routes: FollowedRoutes, distance_scale: float, *, turns: float = 0.0
 ) -> tuple[Float[Tensor, "M N G F"], Bool[Tensor, "M N G"]]:
     """Return every feasible route as features in the agent's frame, and which of them exist.
 
     A feature vector is position, direction and existence of every :data:`STRIDE`-th of the first :data:`POINTS`
     points; ``distance_scale`` are the metres that become 1. With ``turns`` also where the route begins, resolved to
-    decimetres near the agent, and the sine of the turn at every point.
+    decimetres near the agent, and the sine of the turn at every point: as it is, or ``turns`` times that, bounded.
     """
     (point, first, count), mask = routes, routes.length > 1
     state = state[..., None, :].expand(*count.shape, state.shape[-1])
@@ -390,7 +391,7 @@ def route_choices(
 
 
 def _shape_of_routes(
-    state: Float[Tensor, "*b 4"], routes: FollowedRoutes, distance_scale: float, turns: bool
+    state: Float[Tensor, "*b 4"], routes: FollowedRoutes, distance_scale: float, turns: float
 ) -> Float[Tensor, "*b F"]:
     """Return features of routes, each in the frame of its agent."""
     points, count = routes.points(POINTS), routes.length.clamp_max(POINTS)[..., None]
@@ -406,5 +407,6 @@ def _shape_of_routes(
     step = points.diff(dim=-2)
     x, y = (step / step.norm(dim=-1, keepdim=True).clamp_min(1e-3)).unbind(-1)
     turn = x[..., :-1] * y[..., 1:] - y[..., :-1] * x[..., 1:]
+    turn = turn if turns == 1 else (turns * turn).tanh()
     begin = (local[..., 0, :] / 3.0).tanh() * (count > 0)
     return torch.cat([seen.flatten(-2), begin, torch.where(place[2:] < count, turn, 0.0)], -1)

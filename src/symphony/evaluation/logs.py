@@ -37,8 +37,7 @@ def measure(
     As JSON can hold it: ``segments`` and ``skipped`` (with fewer agents); ``collision_rate`` (percent of segments in
     which one of them overlaps another agent) and ``offroad_time`` (percent of their steps), both without the first
     state; ``directions`` (percent of their ``choices`` at branching lanes); ``speed``, ``acceleration``, ``yaw_rate``
-    and ``fit_error`` (metres between log and its fit to the action space, at the end) as percentiles and so on. NaN
-    for what no segment has.
+    and ``fit_error`` (metres between log and its fit to the action space, at the end) as percentiles etc., or NaN.
 
     Raises a :class:`DataError` where no segment has enough interactive agents.
     """

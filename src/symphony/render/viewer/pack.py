@@ -38,8 +38,7 @@ def view_page(names: Sequence[str], found: Iterable[Sequence[Replay | None]]) ->
     ``#segment=ID&rollout=K&t=SECONDS&agent=ID`` behind its address names what it shows.
 
     Takes the names of those that are shown side by side, and for each segment the replay of each of them, None for
-    nothing. Raises a :class:`DataError` where they were simulated on different logs or steps, or a number is too
-    large for the page.
+    nothing. Raises a :class:`DataError` for those of different logs or steps, or a number too large for the page.
     """
     segments: list[dict[str, Any]] = []
     blocks: list[str] = []
