@@ -267,7 +267,7 @@ def card_of(name: str, source: Source, config: TrainConfig, parameters: dict[str
         "format": 1,
         "name": PREFIX + name,
         "method": method,
-        "about": f"{method} (see the table of methods in the README of Symphony): {_method_words(source.spec)} It "
+        "about": f"{method} (see the methods in the documentation of Symphony): {_method_words(source.spec)} It "
         f"drives {config.agent.interactive} vehicles of a run segment at {1 / source.spec.dt:g} Hz while all others "
         "follow their log.",
         "training": {
