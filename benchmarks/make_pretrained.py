@@ -78,7 +78,6 @@ def make(
     *,
     holds: str = "",
     limits: str = "",
-    parts: Sequence[str] = (),
 ) -> Path:
     """Write the folder of an agent and return it.
 
@@ -91,7 +90,6 @@ def make(
         folder: of all these agents.
         holds: what its training data is, in words, where that is no standard set.
         limits: of what it has learned, in words, where that is no standard set.
-        parts: networks that are those of other runs, as ``goals=RUN``.
 
     Raises:
         ConfigError: if the run has no such checkpoint, its data is unknown, or the evaluation is of something else.
@@ -108,8 +106,6 @@ def make(
     changed = replace(spec, search=out.search)
     modules = build_agent(name, changed).modules
     load_checkpoint(checkpoint, modules=modules, partial=True, restore_rng=False)
-    for part, other in (each.split("=", 1) for each in parts):
-        load_checkpoint(choose(*split_name(other)), modules={part: modules[part]}, partial=True, restore_rng=False)
 
     place = folder / name
     shutil.rmtree(place, ignore_errors=True)
@@ -484,7 +480,6 @@ def main(args: Sequence[str] | None = None) -> None:
     parser.add_argument("--goals", default="agent", help="who draws goals together, likewise")
     parser.add_argument("--holds", default="", help="what its training data is, in words")
     parser.add_argument("--limits", default="", help="of what it has learned, in words")
-    parser.add_argument("--parts", nargs="+", default=[], help="networks of other runs, as goals=RUN")
     parser.add_argument("--folder", type=Path, default=FOLDER, help="of all these agents")
     arguments = parser.parse_args(args)
     try:
@@ -498,8 +493,8 @@ def main(args: Sequence[str] | None = None) -> None:
         if arguments.run == PREFIX + arguments.name:
             place = add_scores(arguments.name, arguments.scores, arguments.folder)
         else:
-            more = {"holds": arguments.holds, "limits": arguments.limits, "parts": arguments.parts}
-            place = make(arguments.run, arguments.name, arguments.scores, pruning, arguments.folder, **more)
+            words = {"holds": arguments.holds, "limits": arguments.limits}
+            place = make(arguments.run, arguments.name, arguments.scores, pruning, arguments.folder, **words)
     except SymphonyError as error:
         parser.exit(1, f"error: {error}\n")
     size = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())

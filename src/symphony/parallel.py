@@ -97,7 +97,7 @@ def _put_off() -> Iterator[None]:
     """Handle signals that come meanwhile, whichever thread gets them, at the end: half a start can't be tidied up."""
     came: list[int] = []
     ours = threading.current_thread() is threading.main_thread()  # others get no signals
-    kinds = (signal.SIGINT, signal.SIGTERM) if ours else ()
+    kinds = [kind for kind in (signal.SIGINT, signal.SIGTERM) if ours and signal.getsignal(kind) is not None]
     before = {kind: signal.signal(kind, lambda number, _: came.append(number)) for kind in kinds}
     try:
         yield

@@ -39,7 +39,7 @@ STRIDE = 4  # the goal policy observes every STRIDE-th point of a route
 CHOICE_FEATURES = 5 * (POINTS // STRIDE)
 TURN_FEATURES = 2 + (POINTS - 2)
 """Where a route begins, and a turn at each of its points but the first and the last."""
-MAGNIFIED = 20.0  # times by which sines of turns are observed: those of a change of lanes are a few hundredths
+MAGNIFIED = 20.0  # times that sines of turns are magnified: those of a change of lanes are a few hundredths
 MOVING, WIDE = 2.0, 6.0
 """Speed (m/s) above which a vehicle on no lane is on one as far away (m) as some cut a corner."""
 ONWARD = 200.0  # metres that routes reach beyond what the fastest agent can drive
