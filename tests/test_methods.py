@@ -20,7 +20,7 @@ from helpers_runs import build, pieces, same_weights, stopped, tiny, weights
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony import keys
-from symphony.agents import load_agent
+from symphony.agents import load_agent, observation_of
 from symphony.agents.checkpoint import CheckpointError
 from symphony.collectors import BeamSearchCollector
 from symphony.config import AgentSpec, SearchConfig, TrainConfig, read_json, to_json
@@ -192,12 +192,13 @@ def test_names_that_are_unknown_are_refused(store: Path, tmp_path: Path) -> None
 def test_a_file_that_is_older_than_a_setting_means_what_held_then(tmp_path: Path) -> None:
     """It holds for an included agent, too: it learned from routes of points alone."""
     file = tmp_path / "agent.json"
-    for kept in ("turns", "points", None):
+    for kept, turns in {"changes": 20, "turns": 1, "points": 0, None: 0}.items():
         values = json.loads(to_json(AgentSpec(action_space="bicycle", dt=0.2, goals=True)))
         del values["agent"]["goal_features"]
         values["agent"] |= {"goal_features": kept} if kept else {}
         file.write_text(json.dumps(values))
-        assert read_json(AgentSpec, file).agent.goal_features == (kept or "points")
+        assert (spec := read_json(AgentSpec, file)).agent.goal_features == (kept or "points")
+        assert observation_of(spec).turns == turns
     assert not load_agent("pretrained:mgail_ts_h").observation.turns
 
 
@@ -250,11 +251,12 @@ def test_what_is_searched_is_what_is_imitated(store: Path, tmp_path: Path) -> No
     assert torch.equal(stepped[keys.GOAL], after[keys.GOAL])
 
 
-def test_blame_is_what_came_of_an_action_beyond_the_mean_of_the_other_branches(store, tmp_path):
+@pytest.mark.parametrize("method", ["bc_rl", "bc_rl_h"])
+def test_blame_is_what_came_of_an_action_beyond_the_mean_of_the_other_branches(method, store, tmp_path):
     search = SearchConfig(branches=4, prune_every=4, updates=2, states=8, rule="replace", goals="branch")
     with pytest.raises(ConfigError, match=r"search\.branches must be at least 2"):
-        build(tiny("bc_rl_h", store, tmp_path, search=replace(search, branches=1)))._update(0)
-    trainer = build(tiny("bc_rl_h", store, tmp_path, segments=3, search=search))
+        build(tiny(method, store, tmp_path, search=replace(search, branches=1)))._update(0)
+    trainer = build(tiny(method, store, tmp_path, segments=3, search=search))
     trainer._update(0)
     replay = pieces(trainer)["replay"]
     env, leaves = replay.env, replay.leaves.clone()
