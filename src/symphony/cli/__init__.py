@@ -71,9 +71,9 @@ def main(args: Sequence[str] | None = None) -> int:
             results += [value for mark in marks if isinstance(mark, Result) and str(value or "-") != "-"]
     except errors.ConfigError as error:
         return _complain(error, USAGE)
-    except SystemExit as stop:
+    except (SystemExit, BrokenPipeError) as stop:
         # Help or an error was printed; its reader, such as `head`, may have gone.
-        return guarded(lambda: None) or int(stop.code or 0)
+        return guarded(lambda: None) or int(getattr(stop, "code", FAILED) or 0)
 
     def run() -> None:
         with contextlib.ExitStack() as held:
