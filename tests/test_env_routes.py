@@ -60,11 +60,11 @@ def see(x: float, y: float, heading: float, line: NDArray[np.float64]) -> torch.
     return route_ahead(state, window, SCALE)[0, 0]
 
 
-def choices_of(state: torch.Tensor, *lines: NDArray[np.float64], turns: float = 0.0) -> torch.Tensor:
+def choices_of(state: torch.Tensor, *lines: NDArray[np.float64], change: float = np.inf) -> torch.Tensor:
     """Features [1, 1, G, F] of routes of one agent."""
     count = torch.tensor([[[len(line) for line in lines]]])
     routes = FollowedRoutes(torch.from_numpy(np.concatenate(lines)), count.cumsum(-1) - count, count)
-    return route_choices(state, routes, SCALE, turns=turns)[0]
+    return route_choices(state, routes, torch.full(count.shape, change).double(), SCALE)[0]
 
 
 lines = st.builds(bend, st.integers(2, 20), st.floats(-2.5, 2.5), st.floats(10, 60))
@@ -102,10 +102,8 @@ def test_moving_the_world_changes_no_feature(line, angle, x, y):
     a, b = see(*place, 0.2, line), see(*there(place), 0.2 + angle, there(line))
     torch.testing.assert_close(a, b, atol=1e-6, rtol=0)
     state, moved = [[[*place, 0.2, 5.0]]], [[[*there(place), 0.2 + angle, 5.0]]]
-    for turns in (0, 1, module.MAGNIFIED):
-        one = choices_of(torch.tensor(state).double(), line, turns=turns)
-        two = choices_of(torch.tensor(moved).double(), there(line), turns=turns)
-        torch.testing.assert_close(one, two, atol=1e-6, rtol=0)
+    one, two = choices_of(torch.tensor(state).double(), line), choices_of(torch.tensor(moved).double(), there(line))
+    torch.testing.assert_close(one, two, atol=1e-6, rtol=0)
 
 
 def test_without_a_route_all_features_are_zero():
@@ -135,7 +133,8 @@ def test_what_else_is_in_the_table_changes_nothing(count, seed):
     first, length = (torch.from_numpy(rng.integers(0, 100, (2, 2, 3))) for _ in range(2))
     table[1, 250 : 250 + count] = torch.from_numpy(line)
     first[1, 0, 2], length[1, 0, 2] = 250, count
-    routes = module.Routes(table, first, length, (first, length))
+    change = torch.from_numpy(rng.choice([0.0, 40.0, np.inf], (2, 2, 3)))
+    routes = module.Routes(table, first, length, (first, length), change)
     found = routes.of(torch.tensor([1]), torch.tensor([[2, -1]]))
     points, exist = found.lines()
     assert torch.equal(points[0, 0, :count], torch.from_numpy(line))
@@ -148,13 +147,11 @@ def test_what_else_is_in_the_table_changes_nothing(count, seed):
     moved = torch.from_numpy(rng.uniform(0, 3, (1, 2)))
     alone = one_route(line).progress(place[:, :1], progress[:, :1], moved[:, :1])
     assert torch.equal(found.progress(place, progress, moved)[:, :1], alone)
-    for turns in (0, 1, module.MAGNIFIED):
-        among = routes.among(torch.tensor([1]))
-        features, mask = route_choices(state.expand(1, 2, 4), among, SCALE, turns=turns)
-        assert features.shape == (1, 2, 3, CHOICE_FEATURES + module.TURN_FEATURES * bool(turns))
-        assert torch.equal(mask, length[1:] > 1)
-        assert torch.equal(features[0, 0, 2], choices_of(state, line, turns=turns)[0, 0, 0])
-        assert (features[length[1:] == 0] == 0).all()
+    features, mask = route_choices(state.expand(1, 2, 4), routes.among(torch.tensor([1])), change[1:], SCALE)
+    assert features.shape == (1, 2, 3, CHOICE_FEATURES)
+    assert torch.equal(mask, length[1:] > 1)
+    assert torch.equal(features[0, 0, 2], choices_of(state, line, change=float(change[1, 0, 2]))[0, 0, 0])
+    assert (features[length[1:] == 0] == 0).all()
 
 
 @given(lines, st.integers(2, POINTS - 2), st.floats(-3.5, 3.5), headings)
@@ -162,13 +159,10 @@ def test_turns_say_where_a_route_bends(line, where, aside, heading):
     where = min(where, len(line) - 1)
     jumped = line + np.where(np.arange(len(line)) >= where, aside, 0.0)[:, None] * [0.0, 1.0]
     state = torch.tensor([[[*line[0], heading, 5.0]]], dtype=torch.float64)
-    features = choices_of(state, line, jumped, turns=True)
-    found = features[0, 0, :, CHOICE_FEATURES + 2 :].numpy()
-    fine = choices_of(state, line, jumped, turns=20)[0, 0, :, CHOICE_FEATURES + 2 :]
-    np.testing.assert_allclose(fine, np.tanh(20 * found), atol=1e-6)
+    found = choices_of(state, line, jumped)[0, 0, :, 1 - POINTS : -1].numpy()
     for turns, points in zip(found, (line, jumped), strict=True):
         step = (points[1:] - points[:-1]) @ [1.0, 1j]
-        expected = np.sin(np.angle(step[1:] / step[:-1]))
+        expected = np.tanh(module.MAGNIFIED * np.sin(np.angle(step[1:] / step[:-1])))
         np.testing.assert_allclose(turns[: len(expected)], expected, atol=1e-6)
         assert (turns[len(expected) :] == 0).all()
     other = np.flatnonzero(np.abs(found[0] - found[1]) > 1e-6)
@@ -348,6 +342,14 @@ def test_who_has_not_changed_lanes_took_no_route_that_does(steps):
     table = route_table(segment.replace(valid=segment.valid & (np.arange(21) < steps)), LaneGraph(segment.road), 0)
     aside = np.array([np.ptp(table.line(g)[:, 1]) for g in range(len(table.count))])
     assert 30 * aside[table.right].max() < 3 < aside.max()
+    assert np.array_equal(np.isfinite(table.change), aside > 3)
+    # Routes are known to leave the lane where they do, and the nearer that is, the larger a feature.
+    for begin, g in ((each, g) for g, each in enumerate(table.change) if each < np.inf):
+        leaves = SPACING * (np.abs(np.diff(table.line(g)[:, 1])) > 0.02).argmax()
+        assert begin - SPACING <= leaves <= begin + 2 * SPACING
+    see = choices_of(torch.zeros(1, 1, 4).double(), table.line(0).astype(float), change=30.0)
+    assert see[..., -1] == 0.5
+    assert choices_of(torch.zeros(1, 1, 4).double(), table.line(0).astype(float))[..., -1] == 0
 
 
 def test_who_drives_under_a_bridge_has_no_route_over_it():

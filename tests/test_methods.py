@@ -20,7 +20,6 @@ from helpers_runs import build, pieces, same_weights, stopped, tiny, weights
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony import keys
-from symphony.agents import load_agent, observation_of
 from symphony.agents.checkpoint import CheckpointError
 from symphony.collectors import BeamSearchCollector
 from symphony.config import AgentSpec, SearchConfig, TrainConfig, read_json, to_json
@@ -187,19 +186,6 @@ def test_names_that_are_unknown_are_refused(store: Path, tmp_path: Path) -> None
             read_json(TrainConfig, file)
     file.write_text(json.dumps(good))
     assert read_json(TrainConfig, file).method == "bc_ts"
-
-
-def test_a_file_that_is_older_than_a_setting_means_what_held_then(tmp_path: Path) -> None:
-    """It holds for an included agent, too: it learned from routes of points alone."""
-    file = tmp_path / "agent.json"
-    for kept, turns in {"changes": 20, "turns": 1, "points": 0, None: 0}.items():
-        values = json.loads(to_json(AgentSpec(action_space="bicycle", dt=0.2, goals=True)))
-        del values["agent"]["goal_features"]
-        values["agent"] |= {"goal_features": kept} if kept else {}
-        file.write_text(json.dumps(values))
-        assert (spec := read_json(AgentSpec, file)).agent.goal_features == (kept or "points")
-        assert observation_of(spec).turns == turns
-    assert not load_agent("pretrained:mgail_ts_h").observation.turns
 
 
 def test_checkpoints_must_fall_on_searches(store: Path, tmp_path: Path) -> None:

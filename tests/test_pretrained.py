@@ -25,7 +25,7 @@ from symphony.recipes import train
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = pretrained.pretrained_names()
-METHODS = ("bc_rl", "bc_ts_h", "mgail_ts_h")
+METHODS = ("bc_rl", "bc_ts_h")
 PRUNING = EvaluateConfig(rule="best", prune_every=3)
 
 

@@ -437,7 +437,7 @@ def test_agents_are_searched_as_they_are_meant_to_be(store):
     assert evaluate("constant_velocity", store, replace(LINES, rollouts=1), items=[0]).search == "backtrack"
     with pytest.raises(ConfigError, match="another score: --score flags or rule"):
         blind.plan(EvaluateConfig(search="backtrack"))
-    for name in ("bc_rl", "bc_ts_h", "mgail_ts_h"):
+    for name in ("bc_rl", "bc_ts_h"):
         plan = load_agent(f"pretrained:{name}").plan(EvaluateConfig())
         assert (plan.kind, plan.search.score, plan.search.threshold) == ("backtrack", "rule", 0)
     plan = make_agent(search=SEARCH).plan(EvaluateConfig(rollouts=4))

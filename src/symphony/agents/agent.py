@@ -18,7 +18,7 @@ from symphony.agents.choice import PREFIX, choose, split_name
 from symphony.config import AgentConfig, AgentSpec, EvaluateConfig, SearchConfig, read_json
 from symphony.envs.dynamics import Bicycle, ConstantVelocity, Displacement, RandomActions
 from symphony.envs.observation import OBJECT_FEATURES, POINT_FEATURES, SELF_FEATURES, ObservationConfig
-from symphony.envs.routes import ALONG_FEATURES, CHOICE_FEATURES, MAGNIFIED, ROUTE_FEATURES, TURN_FEATURES
+from symphony.envs.routes import ALONG_FEATURES, CHOICE_FEATURES, ROUTE_FEATURES
 from symphony.errors import ConfigError, DataWarning
 from symphony.imports import build_object, load_object
 from symphony.modules.encoder import FORESIGHT, ElementGroup, SceneEncoder
@@ -44,7 +44,6 @@ def observation_of(spec: AgentSpec, *, discriminator: bool = True) -> Observatio
         num_points=spec.agent.num_points,
         num_lights=spec.agent.num_lights,
         route=spec.goals,
-        turns=spec.goals * {"points": 0.0, "turns": 1.0, "changes": MAGNIFIED}[spec.agent.goal_features],
         along=gaps and spec.goals,
         gaps=gaps,
         clearance=features != "paper",
@@ -86,9 +85,8 @@ def policy_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
 
 def goal_network(spec: AgentSpec) -> ProbabilisticTensorDictSequential:
     """Return the network that draws routes from first states, with an encoder of its own (paper, section III-B)."""
-    features = CHOICE_FEATURES + TURN_FEATURES * (spec.agent.goal_features != "points")
     sizes: dict[str, Any] = {"hidden": spec.agent.hidden, "encoder": _encoder(spec)}
-    return modules.goal_policy(SELF_FEATURES, _groups(spec, route=False), features, **sizes)
+    return modules.goal_policy(SELF_FEATURES, _groups(spec, route=False), CHOICE_FEATURES, **sizes)
 
 
 def discriminator_network(spec: AgentSpec) -> TensorDictModule:

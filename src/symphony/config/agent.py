@@ -34,11 +34,6 @@ class AgentConfig(Settings):
     #: objects, now and within the next 2 s if all keep speed and course, and with goals where they are along its
     #: route.
     features: Literal["paper", "gaps"] = "paper"
-    #: What the goal policy observes of each route. `points`, for older agents: where it is every 12 m; `turns`: also
-    #: where it begins and how much it turns every 3 m; `changes`: magnified, as changes of lanes are small turns.
-    goal_features: Annotated[Literal["points", "turns", "changes"], Fixed, Suppress] = field(
-        default="changes", metadata={"before": "points"}
-    )
     #: Levels of acceleration, an odd number (methods bc*; the paper: 7).
     accelerations: Annotated[int, Bounds(1, 1001)] = 7
     #: Cells along and across of a histogram that displacements are drawn from, an odd number (methods mgail*; 0: one

@@ -44,8 +44,7 @@ def from_dict(kind: Any, values: dict[str, Any], *, where: str = "") -> Any:
     """Build a configuration from plain values.
 
     Removed settings are left out where they had the value that always holds now: ``GONE`` of a class has these values
-    by name, ``...`` for what mattered to the training only, and a function where the value follows from the others. A
-    field whose metadata have ``before`` meant that where it is missing.
+    by name, ``...`` for what mattered to the training only, and a function where the value follows from the others.
 
     Args:
         kind: the dataclass.
@@ -57,8 +56,7 @@ def from_dict(kind: Any, values: dict[str, Any], *, where: str = "") -> Any:
     """
     hints, fields = type_hints(kind), {f.name: f for f in dataclasses.fields(kind)}
     gone = getattr(kind, "GONE", {})
-    before = {f.name: f.metadata["before"] for f in fields.values() if "before" in f.metadata}
-    given = before | {name: value for name, value in values.items() if name not in gone}
+    given = {name: value for name, value in values.items() if name not in gone}
     for name in given:
         if name not in fields:
             raise ConfigError(f"{where}unknown setting '{name}'")

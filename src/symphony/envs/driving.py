@@ -254,8 +254,8 @@ class DrivingEnv(EnvBase):
         """
         row, state = state.get(keys.SCENE).squeeze(-1), state.copy()
         (moved,), routes = _flat(row.ndim, state.get(keys.STATE)), self.scenes.routes.among(row.flatten())
-        scale, turns = self.observation.distance_scale, self.observation.turns
-        features, mask = route_choices(moved, routes, scale, turns=turns)
+        change = self.scenes.route_change[row.flatten()]
+        features, mask = route_choices(moved, routes, change, self.observation.distance_scale)
         state.set(keys.ROUTES, features.reshape(*row.shape, *features.shape[1:]))
         return state.set(keys.ROUTES_MASK, mask.reshape(*row.shape, *mask.shape[1:]))
 

@@ -42,7 +42,6 @@ class ObservationConfig:
     speed_scale: float = 10.0  # m/s that become 1
     size_scale: float = 5.0  # metres of a box side that become 1
     route: bool = False  # whether it observes the route that is its goal
-    turns: float = 0.0  # times by which the goal policy observes turns of routes magnified; 0: not at all
     along: bool = False  # whether it observes where the objects are along that route
     gaps: bool = False  # whether it observes how far its box is from others
     #: whether it observes how far its box is from others and from the edge of the road

@@ -36,10 +36,11 @@ ROUTE_FEATURES = 4 + 3 * (len(AHEAD) - 1)
 ALONG_FEATURES = 11
 BESIDE = 20.0  # metres beside its route within which an agent sees where along it something is
 STRIDE = 4  # the goal policy observes every STRIDE-th point of a route
-CHOICE_FEATURES = 5 * (POINTS // STRIDE)
-TURN_FEATURES = 2 + (POINTS - 2)
-"""Where a route begins, and a turn at each of its points but the first and the last."""
+CHOICE_FEATURES = 5 * (POINTS // STRIDE) + 2 + (POINTS - 2) + 1
+"""What it observes there, where a route begins, the turn at each point but the first and the last, and how near it
+changes lanes."""
 MAGNIFIED = 20.0  # times that sines of turns are magnified: those of a change of lanes are a few hundredths
+CHANGE_SCALE = 30.0  # metres to a change of lanes at which its nearness is one half
 MOVING, WIDE = 2.0, 6.0
 """Speed (m/s) above which a vehicle on no lane is on one as far away (m) as some cut a corner."""
 ONWARD = 200.0  # metres that routes reach beyond what the fastest agent can drive
@@ -58,7 +59,8 @@ class RouteTable:
     points: NDArray[np.float32]  # [P, 2] of all, SPACING apart from beside the vehicle on
     count: NDArray[np.int64]  # [G] points of each
     right: NDArray[np.bool_]  # [G] those nearest to the log; several where they part beyond its end
-    logged: int  # one of these, drawn from segment and agent alone; -1 where the vehicle is on no lane
+    change: NDArray[np.float32]  # [G] metres until each changes lanes; infinite for those that don't
+    logged: int  # one of the right ones, drawn from segment and agent alone; -1 where the vehicle is on no lane
     carried: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
     """What vehicles follow [K, 2] of routes that end beside lanes that go on, by number of the route."""
 
@@ -72,7 +74,8 @@ class RouteTable:
         return self.carried[route] if route in self.carried else self.line(route)
 
 
-NO_ROUTES = RouteTable(np.zeros((0, 2), np.float32), np.zeros(0, np.int64), np.zeros(0, np.bool_), -1)
+_NONE = np.zeros(0, np.float32)
+NO_ROUTES = RouteTable(_NONE.reshape(0, 2), np.zeros(0, np.int64), np.zeros(0, np.bool_), _NONE, -1)
 
 
 def drivable(segment: RunSegment, steps: int) -> float:
@@ -112,7 +115,8 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
     path, there = segment.position[agent, first:, :2], segment.valid[agent, first:]
     if segment.goal is not None and agent == segment.ego:
         path, there = np.concatenate([path, [segment.goal]]), np.append(there, True)
-    right, plain = ground_truth_routes(lines, path, there), np.array([route.change == 0 for route in found])
+    change = np.array([route.until_change(graph, dict(starts)[route.lanes[0]]) for route in found], np.float32)
+    right, plain = ground_truth_routes(lines, path, there), np.isinf(change)
     # Who hardly moved may be about to change lanes, but rarely is, though more routes change lanes than do not.
     right &= plain | ~(right & plain).any()
     tied = np.flatnonzero(right)
@@ -120,7 +124,7 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
     count = np.array([len(line) for line in lines], np.int64)
     kept = [line.astype(np.float32) for line in lines]
     carried = _carried(graph, kept, length, speed)
-    return RouteTable(np.concatenate(kept), count, right, int(tied[draw]), carried)
+    return RouteTable(np.concatenate(kept), count, right, change, int(tied[draw]), carried)
 
 
 def _carried(
@@ -168,14 +172,15 @@ class Packed(NamedTuple):
     length: NDArray[np.int64]  # [N, G] points of each; 0 for padding
     follow_first: NDArray[np.int64]  # [N, G] the same of what is followed of each
     follow_length: NDArray[np.int64]  # [N, G]
+    change: NDArray[np.float32]  # [N, G] metres until each changes lanes
 
 
 def packed(tables: Sequence[RouteTable], least: int = 0) -> Packed:
     """Return the routes of N agents; G is at least ``least``."""
     most = max([least, *(len(table.count) for table in tables)])
-    count = np.zeros((len(tables), most), np.int64)
-    for row, table in zip(count, tables, strict=True):
-        row[: len(table.count)] = table.count
+    count, change = np.zeros((len(tables), most), np.int64), np.zeros((len(tables), most), np.float32)
+    for k, table in enumerate(tables):
+        count[k, : len(table.count)], change[k, : len(table.count)] = table.count, table.change
     first = (count.cumsum() - count.ravel()).reshape(count.shape) * (count > 0)
     follow_first, follow_count = first.copy(), count.copy()
     parts, begin = [np.zeros((0, 2), np.float32), *(t.points for t in tables)], int(count.sum())
@@ -184,7 +189,7 @@ def packed(tables: Sequence[RouteTable], least: int = 0) -> Packed:
             follow_first[k, number], follow_count[k, number] = begin, len(line)
             parts.append(line)
             begin += len(line)
-    return Packed(np.concatenate(parts), first, count, follow_first, follow_count)
+    return Packed(np.concatenate(parts), first, count, follow_first, follow_count, change)
 
 
 def logged_progress(
@@ -209,6 +214,7 @@ class Routes(NamedTuple):
     first: Tensor  # [B, N, G] int64 place in the list of the first point of each route
     length: Tensor  # [B, N, G] int64 points of each; 0 for padding
     followed: tuple[Tensor, Tensor]  # [B, N, G] the same of what agents follow, see :class:`RouteTable`
+    change: Tensor  # [B, N, G] metres until each changes lanes; infinite for those that don't
 
     def of(self, scene: Int[Tensor, " M"], goal: Int[Tensor, "M N"]) -> FollowedRoutes:
         """Return the routes that agents follow: none where there is no route of that number."""
@@ -370,28 +376,29 @@ def along_route(
 
 
 def route_choices(
-    state: Float[Tensor, "M N 4"], routes: FollowedRoutes, distance_scale: float, *, turns: float = 0.0
+    state: Float[Tensor, "M N 4"], routes: FollowedRoutes, change: Float[Tensor, "M N G"], distance_scale: float
 ) -> tuple[Float[Tensor, "M N G F"], Bool[Tensor, "M N G"]]:
     """Return every feasible route as features in the agent's frame, and which of them exist.
 
     A feature vector is position, direction and existence of every :data:`STRIDE`-th of the first :data:`POINTS`
-    points; ``distance_scale`` are the metres that become 1. With ``turns`` also where the route begins, resolved to
-    decimetres near the agent, and the sine of the turn at every point: as it is, or ``turns`` times that, bounded.
+    points; where the route begins, resolved to decimetres near the agent; the sine of the turn at every point,
+    :data:`MAGNIFIED` and bounded; and how near it changes lanes, given the metres until then (infinite: never), from
+    1 for at once to 0 for never. ``distance_scale`` are the metres that become 1.
     """
     (point, first, count), mask = routes, routes.length > 1
     state = state[..., None, :].expand(*count.shape, state.shape[-1])
     if not on_host(count):
-        return _shape_of_routes(state, routes, distance_scale, turns), mask
+        return _shape_of_routes(state, routes, change, distance_scale), mask
     # Some agents have ten times as many routes as most.
     there = (count > 0).flatten().nonzero().squeeze(-1)
     some = FollowedRoutes(point, first.flatten()[there], count.flatten()[there])
-    found = _shape_of_routes(state.flatten(0, -2)[there], some, distance_scale, turns)
+    found = _shape_of_routes(state.flatten(0, -2)[there], some, change.flatten()[there], distance_scale)
     features = found.new_zeros(count.numel(), found.shape[-1]).index_copy(0, there, found)
     return features.unflatten(0, count.shape), mask
 
 
 def _shape_of_routes(
-    state: Float[Tensor, "*b 4"], routes: FollowedRoutes, distance_scale: float, turns: float
+    state: Float[Tensor, "*b 4"], routes: FollowedRoutes, change: Float[Tensor, "*b"], distance_scale: float
 ) -> Float[Tensor, "*b F"]:
     """Return features of routes, each in the frame of its agent."""
     points, count = routes.points(POINTS), routes.length.clamp_max(POINTS)[..., None]
@@ -402,11 +409,9 @@ def _shape_of_routes(
     place = torch.arange(POINTS, device=points.device)
     there = (place[::STRIDE] < count)[..., None].to(state.dtype)
     seen = torch.cat([local / distance_scale, direction, torch.ones_like(there)], -1) * there
-    if not turns:
-        return seen.flatten(-2)
     step = points.diff(dim=-2)
     x, y = (step / step.norm(dim=-1, keepdim=True).clamp_min(1e-3)).unbind(-1)
     turn = x[..., :-1] * y[..., 1:] - y[..., :-1] * x[..., 1:]
-    turn = turn if turns == 1 else (turns * turn).tanh()
-    begin = (local[..., 0, :] / 3.0).tanh() * (count > 0)
-    return torch.cat([seen.flatten(-2), begin, torch.where(place[2:] < count, turn, 0.0)], -1)
+    turn = torch.where(place[2:] < count, (MAGNIFIED * turn).tanh(), 0.0)
+    begin, near = (local[..., 0, :] / 3.0).tanh(), 1.0 / (1.0 + change[..., None] / CHANGE_SCALE)
+    return torch.cat([seen.flatten(-2), begin * (count > 0), turn, near * (count > 0)], -1)

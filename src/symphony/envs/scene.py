@@ -176,6 +176,7 @@ class SceneBatch(TensorClass):
     route_count: Tensor  # [N, G] int64 points of each; 0 for padding
     follow_first: Tensor  # [N, G] the same of the line that is followed, which goes on where lanes beside it do
     follow_count: Tensor  # [N, G]
+    route_change: Tensor  # [N, G] metres until each changes lanes; infinite for those that don't
     route_logged: Tensor  # [N] int64 the route nearest to what the log shows, -1 for none
 
     @property
@@ -187,7 +188,7 @@ class SceneBatch(TensorClass):
     def routes(self) -> Routes:
         """The feasible routes of the interactive agents."""
         lines = self.follow_first, self.follow_count
-        return Routes(self.route_point, self.route_first, self.route_count, lines)
+        return Routes(self.route_point, self.route_first, self.route_count, lines, self.route_change)
 
     def whole_route(self, scene: int, agent: int, route: int) -> Tensor:
         """Return points [K, 2] of one route of an interactive agent, as it is followed."""
@@ -253,6 +254,7 @@ def scene(
         "route_count": taken.length,
         "follow_first": taken.follow_first,
         "follow_count": taken.follow_length,
+        "route_change": taken.change,
         "route_logged": np.array([table.logged for table in tables], np.int64),
     }
     return SceneBatch(
@@ -323,7 +325,7 @@ def with_few_steps(scenes: SceneBatch) -> SceneBatch:
 _TIMED_FIELDS = ("log_state", "log_valid", "light", "agent_height")
 _INDEX_FIELDS = ("point_light", "edge_previous", "edge_following")
 _AGENT_FIELDS = ["interactive", "interactive_valid", "enter", "background"]
-_AGENT_FIELDS += ["route_first", "route_count", "follow_first", "follow_count", "route_logged"]
+_AGENT_FIELDS += ["route_first", "route_count", "follow_first", "follow_count", "route_change", "route_logged"]
 
 
 def _edges(boundary: Polylines, levels: Levels) -> dict[str, NDArray[Any]]:

@@ -292,7 +292,7 @@ class SceneDataset:
     def sample_goals(
         self,
         items: Sequence[int],
-        count: int,
+        count: int | None,
         observation: ObservationConfig,
         rng: torch.Generator,
         device: torch.device | str = "cpu",
@@ -300,17 +300,18 @@ class SceneDataset:
         """Return a training batch for the goal policy: experts at their first state, and their routes.
 
         Returns:
-            TensorDict [count], one agent per row: observation, ``valid``, ``ROUTES``, ``ROUTES_MASK``, ``GOAL``
-            (-1 for vehicles on no lane) and ``GOAL_SET``, all that are equally right.
+            TensorDict [count] (of all experts, without a count), one agent per row: observation, ``valid``,
+            ``ROUTES``, ``ROUTES_MASK``, ``GOAL`` (-1 for vehicles on no lane) and ``GOAL_SET``, all that are equally
+            right.
         """
         each = self.experts.many(items)
         first_steps = [expert.valid.int().argmax(1).tolist() for expert in each]
         found = [(i, k, t) for i, begins in enumerate(first_steps) for k, t in enumerate(begins)]
-        pick = torch.randint(len(found), (count,), generator=rng).tolist()
-        chosen = [found[k] for k in pick]
+        pick = None if count is None else torch.randint(len(found), (count,), generator=rng).tolist()
+        chosen = found if pick is None else [found[k] for k in pick]
         item, _, when = torch.tensor(chosen).unbind(1)
         tables = [each[i].routes[k] for i, k, _ in chosen]
-        points, first, length = (torch.from_numpy(part).to(device) for part in packed(tables, 1)[:3])
+        points, first, length, *_, change = (torch.from_numpy(part).to(device) for part in packed(tables, 1))
         right = np.zeros(length.shape, np.bool_)
         for row, table in enumerate(tables):
             right[row, : len(table.right)] = table.right
@@ -319,8 +320,7 @@ class SceneDataset:
         where = item.to(device), when.to(device), agent.to(device), state
         batch = expert_batch(self._placed(tuple(items), device), *where, observation)
         routes = FollowedRoutes(points, first[:, None], length[:, None])
-        scale, turns = observation.distance_scale, observation.turns
-        features, mask = route_choices(state[:, None], routes, scale, turns=turns)
+        features, mask = route_choices(state[:, None], routes, change[:, None], observation.distance_scale)
         batch.set(keys.ROUTES, features)
         batch.set(keys.ROUTES_MASK, mask)
         batch.set(keys.GOAL, torch.tensor([[table.logged] for table in tables], device=device))

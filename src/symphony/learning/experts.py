@@ -37,7 +37,7 @@ from symphony.roadgraph import LaneGraph, lane_of
 IN_LANE = 1.0
 """Metres from a centre line within which a standing vehicle is taken to wait rather than to be parked."""
 
-VERSION = 5
+VERSION = 6
 """Version of the fit: raised when it gives other numbers or routes for the same segment (a test says when)."""
 PACKAGE = Path(symphony.__file__).parent
 _TENSORS = ("agent", "states", "actions", "valid", "error", "progress")
@@ -266,6 +266,7 @@ class KeptExperts:
                     arrays["route_points"][point_ends[k] : point_ends[k + 1]],
                     arrays["route_count"][end - count : end],
                     arrays["route_right"][end - count : end],
+                    arrays["route_change"][end - count : end],
                     int(arrays["route_logged"][k]),
                     {g: followed[end - count + g] for g in range(count) if end - count + g in followed},
                 )
@@ -288,6 +289,7 @@ class KeptExperts:
             "route_points": np.concatenate([np.zeros((0, 2), np.float32), *(t.points for t in routes)]),
             "route_count": np.concatenate([np.zeros(0, np.int64), *(t.count for t in routes)]),
             "route_right": np.concatenate([np.zeros(0, np.bool_), *(t.right for t in routes)]),
+            "route_change": np.concatenate([np.zeros(0, np.float32), *(t.change for t in routes)]),
             "route_logged": np.array([table.logged for table in routes], np.int64),
             "carried_route": np.array(list(carried), np.int64),
             "carried_count": np.array([len(line) for line in carried.values()], np.int64),
