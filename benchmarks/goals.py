@@ -36,7 +36,18 @@ def first_states(agent: Agent, folder: Path) -> list[TensorDict]:
     """Return what the goal policy observes of all vehicles of each segment, with the routes that they took."""
     data = SceneDataset(SegmentStore(folder), dynamics=dynamics_of(agent.spec), routes=True, keep=64)
     observation, rng = observation_of(agent.spec), torch.Generator()
-    return [data.sample_goals([item], None, observation, rng) for item in range(len(data))]
+    seen, found = set(), []
+    for item in range(len(data)):
+        part = data.sample_goals([item], None, observation, rng)
+        shown = torch.cat([part[keys.OWN], part[keys.ROUTES][:, :, 0]], -1).squeeze(1)
+        rows = [(data.segment(item).group, *(100 * row).round().tolist()) for row in shown]
+        # Segments of one recording may differ in the ego alone, and have the same vehicles.
+        new = torch.tensor([row not in seen for row in rows])
+        seen.update(rows)
+        if new.any():
+            found.append(part[new])
+    print(folder, len(found), sum(map(len, found)), flush=True)
+    return found
 
 
 def together(parts: Sequence[TensorDict]) -> TensorDict:
@@ -100,7 +111,7 @@ def main() -> None:
             optimizer.zero_grad()
             found.backward()
             optimizer.step()
-            total, step = total + float(found) / updates, step + 1
+            total, step = total + float(found.detach()) / updates, step + 1
         each = {name: judged(agent, them) for name, them in shown.items()}
         found = {name: {k: round(v, 3) for k, v in e.items()} for name, e in each.items()}
         print(number + 1, f"{total:.4f}", json.dumps(found), flush=True)

@@ -281,7 +281,7 @@ def test_searches_follow_routes_that_the_goal_policy_draws(store, tmp_path, meth
     """As in evaluation: new ones at every search, feasible, those of a tree together unless branches draw alone."""
     wide = SearchConfig(branches=8, prune_every=99, updates=2, states=8, goals=per)
     replay, drawn = pieces(build(tiny(method, store, tmp_path, segments=3, search=wide)))["replay"], []
-    for _ in range(3):
+    for _ in range(6):
         start, env = replay.collector.rollout()["tree"][..., 0], replay.env
         goal, valid = start[keys.GOAL], start[keys.VALID]
         assert (goal[valid] < env.choices(start)[keys.ROUTES_MASK].sum(-1)[valid]).all()
