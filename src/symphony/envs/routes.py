@@ -115,7 +115,9 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
     path, there = segment.position[agent, first:, :2], segment.valid[agent, first:]
     if segment.goal is not None and agent == segment.ego:
         path, there = np.concatenate([path, [segment.goal]]), np.append(there, True)
-    change = np.array([route.until_change(graph, dict(starts)[route.lanes[0]]) for route in found], np.float32)
+    before = (graph.length[list(route.lanes[: max(route.change - 1, 0)])].sum() for route in found)
+    ways = (lanes + route.begins - dict(starts)[route.lanes[0]] for lanes, route in zip(before, found, strict=True))
+    change = np.where([route.change > 0 for route in found], [*ways], np.inf).astype(np.float32)
     right, plain = ground_truth_routes(lines, path, there), np.isinf(change)
     # Who hardly moved may be about to change lanes, but rarely is, though more routes change lanes than do not.
     right &= plain | ~(right & plain).any()

@@ -300,9 +300,8 @@ class SceneDataset:
         """Return a training batch for the goal policy: experts at their first state, and their routes.
 
         Returns:
-            TensorDict [count] (of all experts, without a count), one agent per row: observation, ``valid``,
-            ``ROUTES``, ``ROUTES_MASK``, ``GOAL`` (-1 for vehicles on no lane) and ``GOAL_SET``, all that are equally
-            right.
+            TensorDict [count], one agent per row (all, without a count): observation, ``valid``, ``ROUTES``,
+            ``ROUTES_MASK``, ``GOAL`` (-1 for vehicles on no lane) and ``GOAL_SET``, all that are equally right.
         """
         each = self.experts.many(items)
         first_steps = [expert.valid.int().argmax(1).tolist() for expert in each]

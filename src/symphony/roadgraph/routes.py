@@ -40,11 +40,6 @@ class Route(NamedTuple):
     begins: float = 0.0  # metres along the lane before that one at which the change begins
     beside: float = 0.0  # metres along the lane it leads to of the place beside that
 
-    def until_change(self, graph: LaneGraph, start: float) -> float:
-        """Return the metres to the change from ``start`` metres along the first lane; infinite without one."""
-        before = sum(float(graph.length[lane]) for lane in self.lanes[: self.change - 1]) + self.begins
-        return before - start if self.change else np.inf
-
 
 Path = tuple[float, Route]  # how far a route reaches ahead of the vehicle, in metres, and the route
 
