@@ -183,6 +183,21 @@ def test_neither_discriminator_nor_search_touches_the_goals(scenes, agent, monke
     assert all(not torch.equal(a, b) for a, b in pairwise(states))
 
 
+def test_a_temperature_makes_the_draws_of_goals_even(env, agent):
+    number = torch.arange(2000).expand(len(env.scenes), -1)
+    start = env.start(torch.arange(len(env.scenes))[:, None].expand(number.shape), number)
+    plain, warm, hot = (
+        draw_goals(env, agent.goals, start, 0, number, heat)
+        for heat in (None, torch.ones(number.shape), torch.full(number.shape, 1e6))
+    )
+    assert torch.equal(plain, warm)
+    count = env.choices(start)[keys.ROUTES_MASK].sum(-1)[:, 0]
+    for b, n in count.nonzero().tolist():
+        share = hot[b, :, n].bincount(minlength=int(count[b, n])) / 2000
+        assert share.sum() == share[: count[b, n]].sum()
+        assert (share - 1 / count[b, n]).abs().max() < 0.05
+
+
 @pytest.mark.parametrize("drawn", [True, False])
 def test_route_goals_are_given_at_each_reset_and_kept_after(scenes, agent, drawn):
     base = DrivingEnv(scenes, agent.dynamics, agent.observation, seed=1)

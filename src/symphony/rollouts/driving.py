@@ -41,6 +41,7 @@ from symphony.rollouts.unroll import (
 RULES: dict[str, Any] = {"constant_velocity": constant_speed, "idm": CarFollower}
 """Rules that can drive background agents in place of the agent, or all agents (an agent's ``rule``)."""
 FEW = 4  # branches of a tree beside a planner, at least
+FIRST_TRIES = 3  # times that a line goes back less far than to its first state: see Backtrack
 
 
 class Simulation(NamedTuple):
@@ -110,10 +111,12 @@ def simulation(
     def fixed(scene: Tensor, goal: Tensor) -> Tensor:
         return _fixed(scenes, scene, goal, given, along_log=config.others == "idm", planned=len(egos))
 
-    def renewed(state: TensorDictBase) -> TensorDictBase:
+    def renewed(state: TensorDictBase, attempt: Tensor) -> TensorDictBase:
         if goals is None or config.logged_goals:
             return state
-        goal = draw_goals(env, goals, state, config.seed, state.get(keys.STREAM).squeeze(-1))
+        # Where the likely routes have led to trouble again and again, others are tried.
+        heat = (attempt - FIRST_TRIES).clamp_min(1)[:, None].float()
+        goal = draw_goals(env, goals, state, config.seed, state.get(keys.STREAM).squeeze(-1), heat)
         return env.with_goals(state, fixed(state.get(keys.SCENE).squeeze(-1), goal))
 
     start = start_states(

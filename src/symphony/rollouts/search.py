@@ -222,10 +222,11 @@ def search(
 
 
 def going_back(
-    env: DrivingEnv, threshold: float, lines: int, begin: Callable[[TensorDictBase], TensorDictBase]
+    env: DrivingEnv, threshold: float, lines: int, begin: Callable[[TensorDictBase, Tensor], TensorDictBase]
 ) -> Backtrack:
     """Return the rule by which lines go back in the driving environment, with random numbers of their own at every
-    try, and at the first states [R, 1] with goals that ``begin`` draws again: the kept ones may be out of reach.
+    try, and at the first states [R, 1] with goals that ``begin`` draws again, given how often each line [R] went
+    back: the kept ones may be out of reach.
     """
 
     def renew(state: TensorDictBase, attempt: Int[Tensor, " R"]) -> TensorDictBase:
@@ -234,7 +235,7 @@ def going_back(
         found = env.at(state.copy().set(keys.STREAM, stream))
         first = (found.get(keys.STEP)[:, 0, 0] == 0).nonzero().squeeze(-1)
         if len(first):
-            found[first] = begin(found[first])
+            found[first] = begin(found[first], attempt[first])
         return found
 
     return Backtrack(threshold, renew=renew, width=max(FEW, lines // FILL))

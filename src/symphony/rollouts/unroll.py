@@ -21,7 +21,7 @@ from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError, SymphonyError
 from symphony.geometry.nearest import on_host
 from symphony.metrics import collisions
-from symphony.modules import drawn_goals
+from symphony.modules import drawn_goals, inverse_cdf
 from symphony.streams import Stream, fold_in, uniform
 
 _WORLD = 1 << 22
@@ -72,10 +72,15 @@ def simulate(
 
 @torch.no_grad()
 def draw_goals(
-    env: DrivingEnv, goals: TensorDictModuleBase, start: TensorDictBase, seed: int, tree: Int[Tensor, "*b"]
+    env: DrivingEnv,
+    goals: TensorDictModuleBase,
+    start: TensorDictBase,
+    seed: int,
+    tree: Int[Tensor, "*b"],
+    temperature: Float[Tensor, "*b"] | None = None,
 ) -> Int[Tensor, "*b N"]:
     """Return the route [..., N] that the goal policy draws for each agent from a start state, -1 for none; ``tree``
-    is the number of the draw within its scene.
+    is the number of the draw within its scene, and a ``temperature`` above 1 makes unlikely routes more likely.
 
     In open traffic, later agents draw as if all were there already; past the log, where that is unknown, as if alone.
     """
@@ -85,7 +90,10 @@ def draw_goals(
         seen = env.choices(state).set(keys.GOAL_NOISE, noise)
         with set_exploration_type(ExplorationType.RANDOM):
             seen = goals(seen)
-        return drawn_goals(seen.get(keys.GOAL), seen.get(keys.ROUTES_MASK))
+        goal = seen.get(keys.GOAL)
+        if temperature is not None:
+            goal = inverse_cdf(seen.get(keys.GOAL_LOGITS) / temperature[..., None, None], noise)
+        return drawn_goals(goal, seen.get(keys.ROUTES_MASK))
 
     found, waiting = drawn(start), start.get(keys.WAITING, None)
     if waiting is None:
