@@ -90,10 +90,11 @@ def draw_goals(
         seen = env.choices(state).set(keys.GOAL_NOISE, noise)
         with set_exploration_type(ExplorationType.RANDOM):
             seen = goals(seen)
-        goal = seen.get(keys.GOAL)
+        goal, mask = seen.get(keys.GOAL), seen.get(keys.ROUTES_MASK)
         if temperature is not None:
-            goal = inverse_cdf(seen.get(keys.GOAL_LOGITS) / temperature[..., None, None], noise)
-        return drawn_goals(goal, seen.get(keys.ROUTES_MASK))
+            logits = seen.get(keys.GOAL_LOGITS)
+            goal = inverse_cdf(torch.where(mask, logits / temperature[..., None, None], logits), noise)
+        return drawn_goals(goal, mask)
 
     found, waiting = drawn(start), start.get(keys.WAITING, None)
     if waiting is None:
