@@ -140,27 +140,8 @@ def test_a_warm_start_that_does_not_fit_leaves_no_run_behind(trained, store, tmp
         assert not (tmp_path / "run" / "config.json").exists()
 
 
-# With a value that can be read; half of it can't. A head is twice as wide as the encoders.
-GONE = ("agent.num_objects", 16), ("agent.head", 16), ("discriminator.radius", 20.0), ("search.keep", 0.5)
-
-
-@pytest.mark.parametrize(("name", "always"), GONE)
-def test_a_setting_that_is_gone_is_read_where_it_said_what_holds_now(store, tmp_path, name, always):
-    spec = build(tiny("bc_ts", store, tmp_path / "run")).agent.spec
-    file, (part, last) = tmp_path / "agent.json", name.split(".")
-    saved = json.loads(to_json(spec))
-    saved["search"]["survivors"] = "best"  # which mattered to the training only
-    saved[part][last] = always
-    file.write_text(json.dumps(saved))
-    assert read_json(AgentSpec, file) == spec
-    saved[part][last] = always / 2
-    file.write_text(json.dumps(saved))
-    with pytest.raises(ConfigError, match=rf"agent\.json: {part}\.setting '{last}' is gone"):
-        read_json(AgentSpec, file)
-
-
 @pytest.mark.parametrize(("part", "change", "expected"), [
-    ("agent", {"hidden": None, "head": 128}, "agent.hidden must be int"),
+    ("agent", {"hidden": None}, "agent.hidden must be int"),
     ("agent", {"hidden": 10**30}, "agent.hidden must be at most"),
     ("agent", {"interactive": 10**30}, "agent.interactive must be at most"),
     ("", {"dt": 10**400}, "dt must be float"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import Fixed, Suppress, arg
 
@@ -45,7 +45,6 @@ class AgentConfig(Settings):
     encoder: Own = "paper"
     #: Policy: `paper`, or the import path of a function from an `AgentSpec` to a policy module.
     policy: Own = "paper"
-    GONE: ClassVar = {"num_objects": 16, "persona": False, "head": lambda values: 2 * values.get("hidden", 64)}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -66,8 +65,6 @@ class DiscriminatorConfig(Settings):
     #: Discriminator: `paper`, or the import path of a function from an `AgentSpec` to a module that writes one logit
     #: per agent.
     network: Own = "paper"
-    _TRAINED: ClassVar = dict.fromkeys(("states", "learning_rate", "gradient_penalty", "instance_noise"), ...)
-    GONE: ClassVar = {"radius": 20.0, "head": lambda values: 2 * values.get("hidden", 32), **_TRAINED}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +91,6 @@ class SearchConfig(Settings):
     #: States per update: this many of the surviving rollouts for the policy to learn from, and this many of all
     #: rollouts and of the log for the discriminator; each is of all interactive agents of its run segment.
     states: Count = 256
-    _TRAINED: ClassVar = dict.fromkeys(("segments", "weight", "survivors"), ...)
-    GONE: ClassVar = {"keep": 0.5, "aggregate": "max_then_sum", **_TRAINED}
 
 
 @dataclass(frozen=True, kw_only=True)

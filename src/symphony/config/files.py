@@ -22,7 +22,7 @@ def to_json(config: Any) -> str:
 
 
 def read_json(kind: type[Any], file: Path) -> Any:
-    """Read a configuration that :func:`to_json` wrote; settings of older agents become today's.
+    """Read a configuration that :func:`to_json` wrote.
 
     Raises:
         ConfigError: if it is not such a file; names it and the setting.
@@ -43,9 +43,6 @@ def read_json(kind: type[Any], file: Path) -> Any:
 def from_dict(kind: Any, values: dict[str, Any], *, where: str = "") -> Any:
     """Build a configuration from plain values.
 
-    Removed settings are left out where they had the value that always holds now: ``GONE`` of a class has these values
-    by name, ``...`` for what mattered to the training only, and a function where the value follows from the others.
-
     Args:
         kind: the dataclass.
         values: by the names of its fields, nested ones as dicts.
@@ -55,20 +52,14 @@ def from_dict(kind: Any, values: dict[str, Any], *, where: str = "") -> Any:
         ConfigError: for an unknown name, a missing one, another type or a value out of range.
     """
     hints, fields = type_hints(kind), {f.name: f for f in dataclasses.fields(kind)}
-    gone = getattr(kind, "GONE", {})
-    given = {name: value for name, value in values.items() if name not in gone}
-    for name in given:
+    for name in values:
         if name not in fields:
             raise ConfigError(f"{where}unknown setting '{name}'")
     for name, field in fields.items():
         needed = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        if needed and name not in given:
+        if needed and name not in values:
             raise ConfigError(f"{where}setting '{name}' is missing")
-    built = {name: _typed(hints[name], value, where, name) for name, value in given.items()}
-    for name, held in gone.items():
-        meant = held(built) if callable(held) else held
-        if meant is not ... and values.get(name, meant) != meant:
-            raise ConfigError(f"{where}setting '{name}' is gone: this version reads only {meant!r}")
+    built = {name: _typed(hints[name], value, where, name) for name, value in values.items()}
     try:
         return kind(**built)
     except ConfigError as error:
