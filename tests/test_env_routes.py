@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -471,6 +471,7 @@ def test_an_expert_that_goes_on_past_the_end_of_its_lane_is_not_left_there(tmp_p
 
 
 @settings(max_examples=2)
+@example([(-1, float(k == 2)) for k in range(9)], 0.0, 0.0)
 @given(
     st.lists(st.tuples(st.sampled_from([-1, 1]), st.floats(-1.5, 1.5)), min_size=9, max_size=9),
     st.floats(0, 40), st.floats(0, 12),

@@ -44,8 +44,9 @@ CHANGE_SCALE = 30.0  # metres to a change of lanes at which its nearness is one 
 MOVING, WIDE = 2.0, 6.0
 """Speed (m/s) above which a vehicle on no lane is on one as far away (m) as some cut a corner."""
 ONWARD = 200.0  # metres that routes reach beyond what the fastest agent can drive
-_FASTER, _FASTEST = 1.1, 45.0
-"""Factor by which vehicles may be faster than the fastest of the log, and the m/s up to which they may."""
+_FASTER, _FASTEST, _LATER = 1.1, 45.0, 15.0
+"""Factor by which vehicles may be faster than the fastest of the log, the m/s up to which they may, and m/s that
+they may have past its end, if it stands still."""
 _BACK, _SEARCHED = 4, 16
 """Points before the last place along a route from which on the next one is sought, and points searched."""
 _CUT, _SLACK = 1.5, 3.0
@@ -81,7 +82,8 @@ NO_ROUTES = RouteTable(_NONE.reshape(0, 2), np.zeros(0, np.int64), np.zeros(0, n
 def drivable(segment: RunSegment, steps: int) -> float:
     """Return the metres that the fastest agent of a segment can drive in ``steps`` steps, or a little more."""
     speed = np.linalg.norm(segment.velocity[segment.valid], axis=-1).max(initial=0.0)
-    return min(_FASTER * float(speed), _FASTEST) * (steps - 1) * segment.dt
+    least = _LATER if steps > segment.log_steps else 0.0
+    return max(min(_FASTER * float(speed), _FASTEST), least) * (steps - 1) * segment.dt
 
 
 def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 0) -> RouteTable:
@@ -115,9 +117,8 @@ def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 
     path, there = segment.position[agent, first:, :2], segment.valid[agent, first:]
     if segment.goal is not None and agent == segment.ego:
         path, there = np.concatenate([path, [segment.goal]]), np.append(there, True)
-    before = (graph.length[list(route.lanes[: max(route.change - 1, 0)])].sum() for route in found)
-    ways = (lanes + route.begins - dict(starts)[route.lanes[0]] for lanes, route in zip(before, found, strict=True))
-    change = np.where([route.change > 0 for route in found], [*ways], np.inf).astype(np.float32)
+    way = [graph.length[[*r.lanes[: max(r.change - 1, 0)]]].sum() - dict(starts)[r.lanes[0]] for r in found]
+    change = np.array([w + r.begins if r.change else np.inf for w, r in zip(way, found, strict=True)], np.float32)
     right, plain = ground_truth_routes(lines, path, there), np.isinf(change)
     # Who hardly moved may be about to change lanes, but rarely is, though more routes change lanes than do not.
     right &= plain | ~(right & plain).any()
