@@ -198,6 +198,14 @@ def test_a_temperature_makes_the_draws_of_goals_even(env, agent):
         assert (share - 1 / count[b, n]).abs().max() < 0.05
 
 
+def test_lines_that_fail_again_from_their_first_state_draw_less_likely_routes(scenes, agent, monkeypatch):
+    heats = []
+    noted = lambda *args: heats.append(args[5]) or draw_goals(*args)  # noqa: E731
+    monkeypatch.setattr(sys.modules["symphony.rollouts.driving"], "draw_goals", noted)
+    driven(agent, scenes, "backtrack", score="rule", threshold=-1.0)
+    assert torch.cat(heats).unique().tolist()[:4] == [1, 2, 3, 4]
+
+
 @pytest.mark.parametrize("drawn", [True, False])
 def test_route_goals_are_given_at_each_reset_and_kept_after(scenes, agent, drawn):
     base = DrivingEnv(scenes, agent.dynamics, agent.observation, seed=1)
