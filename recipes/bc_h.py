@@ -6,8 +6,7 @@ import torch
 
 from symphony import BCLoss, GoalLoss, SegmentStore, TrainConfig
 from symphony.agents import Agent, bicycle, goal_network, observation_of, policy_network
-from symphony.config.training import GOALS
-from symphony.learning import SceneDataset
+from symphony.learning import GOALS, SceneDataset
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
 
 
@@ -33,7 +32,8 @@ def bc_h(config: TrainConfig, processes: Processes) -> Trainer:
         yield "policy", policy_loss(experts)
         yield "goals", goal_loss(data.sample_goals(items, GOALS, observation, rng, device))
 
-    phases = [Phase(config.steps, update, cosine(config.rates(optimizers), config.steps))]
+    rates = cosine(config.rates(optimizers), config.steps, goals=data.goal_updates(config.steps))
+    phases = [Phase(config.steps, update, rates)]
     return Trainer(config, agent, data, phases, optimizers, rng, processes)
 
 

@@ -11,8 +11,7 @@ from tensordict.nn import TensorDictSequential
 from symphony import DistillationLoss, DrivingEnv, GoalLoss, SegmentStore, TrainConfig
 from symphony.agents import Agent, bicycle, goal_network, observation_of, policy_network
 from symphony.collectors import BeamSearchCollector, KeepAll, with_rows
-from symphony.config.training import GOALS
-from symphony.learning import SceneDataset, SearchReplay, with_survivors
+from symphony.learning import GOALS, SceneDataset, SearchReplay, with_survivors
 from symphony.modules import SeededNoise
 from symphony.rollouts.search import collector_settings, realism_score, with_drawn_goals
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
@@ -54,7 +53,8 @@ def bc_rl_h(config: TrainConfig, processes: Processes) -> Trainer:
         yield "policy", policy_loss(with_survivors(experts, rollouts))
         yield "goals", goal_loss(data.sample_goals(items, GOALS, observation, rng, env.device))
 
-    phases = [Phase(config.steps, update, cosine(config.rates(optimizers), config.steps))]
+    rates = cosine(config.rates(optimizers), config.steps, goals=data.goal_updates(config.steps))
+    phases = [Phase(config.steps, update, rates)]
     return Trainer(config, agent, data, phases, optimizers, rng, processes, replay)
 
 

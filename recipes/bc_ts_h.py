@@ -8,8 +8,7 @@ from tensordict.nn import TensorDictSequential
 from symphony import DiscriminatorLoss, DistillationLoss, DrivingEnv, GoalLoss, SegmentStore, TrainConfig
 from symphony.agents import Agent, bicycle, discriminator_network, goal_network, observation_of, policy_network
 from symphony.collectors import BeamSearchCollector, with_rows
-from symphony.config.training import GOALS
-from symphony.learning import SceneDataset, SearchReplay, with_survivors
+from symphony.learning import GOALS, SceneDataset, SearchReplay, with_survivors
 from symphony.modules import SeededNoise
 from symphony.rollouts.search import collector_settings, pruning_rule, realism_score, with_drawn_goals
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
@@ -53,7 +52,8 @@ def bc_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
         yield "policy", policy_loss(with_survivors(experts, rollouts))
         yield "goals", goal_loss(data.sample_goals(items, GOALS, observation, rng, env.device))
 
-    phases = [Phase(config.steps, update, cosine(config.rates(optimizers), config.steps))]
+    rates = cosine(config.rates(optimizers), config.steps, goals=data.goal_updates(config.steps))
+    phases = [Phase(config.steps, update, rates)]
     return Trainer(config, agent, data, phases, optimizers, rng, processes, replay)
 
 

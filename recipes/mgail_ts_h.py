@@ -8,9 +8,8 @@ from tensordict.nn import TensorDictSequential
 from symphony import BCLoss, DiscriminatorLoss, GoalLoss, MGAILLoss, SegmentStore, TrainConfig
 from symphony.agents import Agent, discriminator_network, goal_network, observation_of, policy_network
 from symphony.collectors import BeamSearchCollector, with_rows
-from symphony.config.training import GOALS
 from symphony.envs import Displacement, DrivingEnv
-from symphony.learning import SceneDataset, SearchReplay
+from symphony.learning import GOALS, SceneDataset, SearchReplay
 from symphony.modules import SeededNoise
 from symphony.rollouts.search import collector_settings, compiled, pruning_rule, realism_score, with_drawn_goals
 from symphony.training import Phase, Processes, Trainer, Updates, cosine
@@ -44,7 +43,7 @@ def mgail_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
     mgail_loss = processes.wrap_ddp(MGAILLoss(policy, discriminator, env, **config.mgail.gradient, **compiled(data)))
     realism_loss = processes.wrap_ddp(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
-    rates = config.rates(optimizers)
+    rates, last = config.rates(optimizers), data.goal_updates(config.steps)
     seen, begin, device = observation_of(spec, discriminator=False), config.mgail.regression, processes.device
 
     # The order of updates, in three phases; goals are learned in all.
@@ -68,9 +67,10 @@ def mgail_ts_h(config: TrainConfig, processes: Processes) -> Trainer:
             losses["loss_regression"] = config.mgail.expert_weight * next(regression(step))[1]["loss_bc"]
         yield "policy", losses
 
-    slower = cosine(rates | {"policy": config.mgail.learning_rate}, config.steps, begin)
+    slower = cosine(rates | {"policy": config.mgail.learning_rate}, config.steps, begin, goals=last)
+    first = Phase(begin, regression, cosine(rates, begin, goals=last))
     ready = Phase(begin + config.mgail.head_start, head_start, slower)
-    phases = [Phase(begin, regression, cosine(rates, begin)), ready, Phase(config.steps, adversarial, slower)]
+    phases = [first, ready, Phase(config.steps, adversarial, slower)]
     return Trainer(config, agent, data, phases, optimizers, rng, processes, replay)
 
 

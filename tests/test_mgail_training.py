@@ -95,7 +95,8 @@ def test_each_phase_changes_the_networks_it_is_for(store, tmp_path, method, cell
     for step, phase in enumerate(phases):
         before = copies(trainer)
         record = trainer._update(step)
-        assert moved(before, copies(trainer)) == phase | goals
+        # The store has few agents, so goals are learned after two updates.
+        assert moved(before, copies(trainer)) == phase | (goals if step < 2 else set())
         assert {name.removeprefix("loss_") for name in record if name.startswith("loss_")} == phase | goals
         assert ("loss_discriminator" in record) == ("search_auc_collision" in record) == (step >= 2)
         assert ("policy_mgail_score" in record) == (step >= 3)
@@ -104,6 +105,7 @@ def test_each_phase_changes_the_networks_it_is_for(store, tmp_path, method, cell
         rates.append(trainer.optimizers["policy"].param_groups[0]["lr"])
     # The policy's rate starts anew with the second phase, at one of its own.
     assert rates[0] == trainer.config.learning_rate > rates[1] > rates[2] == SHORT.learning_rate > rates[3]
+    assert trainer.data.goal_updates(10) == 2 == -(-10 * int(trainer.data.store.num_agents.sum()) // 128)
     # Goals and discriminator learn nothing from the loss of the policy.
     used = pieces(trainer)
     for module in trainer.agent.modules.values():

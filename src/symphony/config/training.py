@@ -20,8 +20,6 @@ METHODS: tuple[str, ...] = get_args(Row)
 Method = Literal[Row, "bc_rl", "bc_rl_h"]
 """Methods that have a recipe: also BC and BC+H with a policy gradient (RL), which is not in the paper."""
 Cost = Literal["log_d", "non_saturating", "logit"]
-GOALS = 128
-"""Expert routes per update of the goal policy."""
 DISCRIMINATOR_RATE = 1e-3
 """Learning rate of the discriminator's Adam, falling to a tenth along a cosine."""
 ROWS, AGE = 256, 32

@@ -158,6 +158,11 @@ class SegmentStore(Sequence[RunSegment]):
         return self._segments["steps"].astype(np.int64)
 
     @property
+    def num_agents(self) -> NDArray[np.int64]:
+        """The number of agents of each segment [segments], whoever is there at some step."""
+        return self._segments["count"][:, SEGMENTS.axes["agents"]].astype(np.int64)
+
+    @property
     def time_steps(self) -> NDArray[np.float64]:
         """The seconds per step of each segment [segments]."""
         return self._segments["dt"].astype(np.float64)
@@ -273,7 +278,7 @@ class SegmentStore(Sequence[RunSegment]):
         points = maps["count"][:, axes].sum(axis=1)
         return {
             "segments": len(self),
-            "agents": int(segments["count"][:, SEGMENTS.axes["agents"]].sum()),
+            "agents": int(self.num_agents.sum()),
             "signals": int(segments["count"][:, SEGMENTS.axes["signals"]].sum()),
             "sources": dict(sorted(Counter(self.sources.tolist()).items())),
             "steps": _span(steps),

@@ -35,6 +35,8 @@ SHARE = 0.125
 """Part of the machine's memory that one cache may take; a data set has two."""
 GRAPHS = 64
 """Lane graphs held in memory."""
+GOALS, PASSES = 128, 10
+"""Agents per update of the goal policy, and how often it learns from each before it stops."""
 DISPLACED = 2.0
 """Metres that a state to learn from may lie from the log, within which its place along the route is sought."""
 
@@ -288,6 +290,13 @@ class SceneDataset:
         routes = None if seen is None else RouteWindow(*(part.to(device) for part in seen))
         action = action.to(device)
         return expert_batch(self._placed(tuple(items), device), *where, observation, action=action, routes=routes)
+
+    def goal_updates(self, most: int) -> int:
+        """Return after how many updates the goal policy has learned from each agent ``PASSES`` times, or ``most``.
+
+        An agent chooses one route, so soon after that the choices of few are learned by heart.
+        """
+        return min(most, -(-PASSES * int(self.store.num_agents[self.indices].sum()) // GOALS))
 
     def sample_goals(
         self,

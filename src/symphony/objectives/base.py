@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int, Num, Shaped
@@ -155,6 +155,7 @@ class ActorLoss(MaskedLoss):
         use_mask: see :class:`MaskedLoss`.
     """
 
+    losses: ClassVar[tuple[str, ...]] = ()
     actor_network: ProbabilisticTensorDictSequential
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
@@ -162,9 +163,10 @@ class ActorLoss(MaskedLoss):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential | ProbabilisticTensorDictModule,
-        reduction: Reduction | None,
-        label_smoothing: float,
-        use_mask: bool | None,
+        *,
+        reduction: Reduction | None = None,
+        label_smoothing: float = 0.0,
+        use_mask: bool | None = None,
     ) -> None:
         super().__init__(reduction, use_mask)
         if not 0.0 <= label_smoothing < 1.0:
@@ -176,6 +178,7 @@ class ActorLoss(MaskedLoss):
         if label_smoothing and not self.categorical:
             raise ValueError("label_smoothing needs an actor whose distribution is a torch Categorical")
         self.label_smoothing = label_smoothing
+        self.out_keys = [*self.losses, *(["entropy", "accuracy"] if self.categorical else [])]
 
     def _read_keys(self) -> list[NestedKey]:
         return [*self.actor_network.in_keys, self.tensor_keys.action]
@@ -255,17 +258,7 @@ class BCLoss(ActorLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential | ProbabilisticTensorDictModule,
-        *,
-        reduction: Reduction | None = None,
-        label_smoothing: float = 0.0,
-        use_mask: bool | None = None,
-    ) -> None:
-        super().__init__(actor_network, reduction, label_smoothing, use_mask)
-        self.out_keys = ["loss_bc", "entropy", "accuracy"] if self.categorical else ["loss_bc"]
+    losses = ("loss_bc",)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -317,18 +310,7 @@ class DistillationLoss(ActorLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential | ProbabilisticTensorDictModule,
-        *,
-        reduction: Reduction | None = None,
-        label_smoothing: float = 0.0,
-        use_mask: bool | None = None,
-    ) -> None:
-        super().__init__(actor_network, reduction, label_smoothing, use_mask)
-        statistics = ["entropy", "accuracy"] if self.categorical else []
-        self.out_keys = ["loss_distillation", "nll_expert", "nll_rollout", *statistics]
+    losses = ("loss_distillation", "nll_expert", "nll_rollout")
 
     def _read_keys(self) -> list[NestedKey]:
         return [*super()._read_keys(), self.tensor_keys.rollout]

@@ -87,12 +87,18 @@ class Phase:
     rates: Rates
 
 
-def cosine(rates: Mapping[str, float], end: int, begin: int = 0) -> Rates:
-    """Return rates that fall to a tenth along a cosine, from update ``begin`` to ``end``."""
+def cosine(rates: Mapping[str, float], end: int, begin: int = 0, **ends: int) -> Rates:
+    """Return rates that fall to a tenth along a cosine, from update ``begin`` to ``end``.
+
+    Networks named in ``ends`` learn from update 0 to an end of their own, and not at all after it.
+    """
+
+    spans = {name: (0, ends[name]) if name in ends else (begin, end) for name in rates}
 
     def at(step: int) -> Mapping[str, float]:
-        share = 0.5 * (1 + math.cos(math.pi * (step - begin) / (end - begin)))
-        return {name: rate * (0.1 + 0.9 * share) for name, rate in rates.items()}
+        done = {name: (step - first) / (last - first) for name, (first, last) in spans.items()}
+        falls = {name: 0.55 + 0.45 * math.cos(math.pi * share) if share < 1 else 0.0 for name, share in done.items()}
+        return {name: rate * falls[name] for name, rate in rates.items()}
 
     return at
 
