@@ -69,7 +69,9 @@ def of(network: str, found: dict[str, Tensor]) -> dict[str, Tensor]:
 @pytest.mark.parametrize("method", METHODS)
 def test_each_method_trains_its_networks_and_tells_of_them(trained, store, tmp_path, method):
     run = trained(method)
-    fresh, after = build(tiny(method, store, tmp_path)).agent.modules, weights(run)
+    trainer, after = build(tiny(method, store, tmp_path)), weights(run)
+    fresh, rates = trainer.agent.modules, trainer.phases[0].rates
+    assert all((rates(step).get("goals", 0) > 0) == (step < 2 and "goals" in fresh) for step in range(4))
     assert set(fresh) == {name.split(".")[0] for name in after} == NETWORKS[method]
     for name, module in fresh.items():
         before = {f"{name}.{key}": value for key, value in module.state_dict().items()}
