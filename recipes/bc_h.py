@@ -32,7 +32,7 @@ def bc_h(config: TrainConfig, processes: Processes) -> Trainer:
         yield "policy", policy_loss(experts)
         yield "goals", goal_loss(data.sample_goals(items, GOALS, observation, rng, device))
 
-    rates = cosine(config.rates(optimizers), config.steps, goals=data.goal_updates(config.steps))
+    rates = cosine(config.rates(optimizers), config.steps, goals=data.goal_updates(config.steps, processes.count))
     phases = [Phase(config.steps, update, rates)]
     return Trainer(config, agent, data, phases, optimizers, rng, processes)
 

@@ -43,7 +43,7 @@ def mgail_h(config: TrainConfig, processes: Processes) -> Trainer:
     mgail_loss = processes.wrap_ddp(MGAILLoss(policy, discriminator, env, **config.mgail.gradient, **compiled(data)))
     realism_loss = processes.wrap_ddp(DiscriminatorLoss(discriminator))
     optimizers = {name: torch.optim.Adam(network.parameters()) for name, network in agent.modules.items()}
-    rates, last = config.rates(optimizers), data.goal_updates(config.steps)
+    rates, last = config.rates(optimizers), data.goal_updates(config.steps, processes.count)
     seen, begin, device = observation_of(spec, discriminator=False), config.mgail.regression, processes.device
 
     # The order of updates, in three phases; goals are learned in all.

@@ -88,17 +88,16 @@ class Phase:
 
 
 def cosine(rates: Mapping[str, float], end: int, begin: int = 0, **ends: int) -> Rates:
-    """Return rates that fall to a tenth along a cosine, from update ``begin`` to ``end``.
+    """Return rates that fall to a tenth along a cosine, from update ``begin`` to ``end``, and are 0 after it.
 
-    Networks named in ``ends`` learn from update 0 to an end of their own, and not at all after it.
+    Networks named in ``ends`` learn from update 0 to an end of their own. A KeyError names one without a rate.
     """
-
-    spans = {name: (0, ends[name]) if name in ends else (begin, end) for name in rates}
+    spans = dict.fromkeys(rates, (begin, end)) | {name: (0, last) for name, last in ends.items()}
 
     def at(step: int) -> Mapping[str, float]:
         done = {name: (step - first) / (last - first) for name, (first, last) in spans.items()}
         falls = {name: 0.55 + 0.45 * math.cos(math.pi * share) if share < 1 else 0.0 for name, share in done.items()}
-        return {name: rate * falls[name] for name, rate in rates.items()}
+        return {name: rates[name] * fall for name, fall in falls.items()}
 
     return at
 
