@@ -52,7 +52,7 @@ class Test(shared.Command):
     out: Annotated[Path, arg(metavar="DIR")] = Path("out/test")
     junit: shared.ResultFile = None  # File to write the JUnit XML to as well.
     json: shared.Json = None
-    view: bool = True  # Leave the pages that play the rollouts unwritten.
+    view: bool = True  # Whether the pages that play the rollouts are written.
     workers: shared.Workers = 1
     engine: shared.EngineName = "local"
     device: Device = "cpu"

@@ -37,7 +37,7 @@ class Simulate(shared.Simulation):
     #: Goals of agents, by their ids in the source: `7=lane:103` for a route over the lane of that id, `7=12.5,-40`
     #: for one that passes a point (metres, in the frame of the segment); all others as the agent draws them.
     goal: Annotated[tuple[str, ...], arg(metavar="ID=PLACE ...")] = ()
-    tree: bool = True  # Leave out the branches that a search pruned.
+    tree: bool = True  # Whether the branches that a search pruned are saved, too.
     config: Annotated[evaluation.SimulateConfig, arg(name="")] = field(default_factory=evaluation.SimulateConfig)
 
     def __post_init__(self) -> None:
@@ -139,7 +139,7 @@ class Report(shared.Command):
     folder: shared.Saved
     out: shared.Folder = None  # Folder of the report; by default the same folder.
     evaluated: Literal["interactive", "ego"] = "interactive"  # Evaluate all driven agents, or the ego.
-    view: bool = True  # Leave the page that plays the rollouts unwritten.
+    view: bool = True  # Whether the page that plays the rollouts is written.
 
     def __call__(self) -> None:
         from symphony.evaluation.report import report

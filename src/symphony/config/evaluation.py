@@ -118,7 +118,7 @@ class EvaluateConfig(SimulationConfig):
     #: log) or the agent itself (`learned`). They are not evaluated; traffic is open for all but the log.
     others: Others = "log"
     metric: Annotated[tuple[str, ...], Fixed, Suppress] = ()  # Import paths of metrics of your own.
-    #: Run segments simulated at a time (changes memory and speed, not results); 0: up to 64, or 16 with a planner, on
+    #: Run segments simulated at a time (changes memory, speed and rounding); 0: up to 64, or 16 with a planner, on
     #: a card up to 1 024, fewer where their agents see many points.
     batch: Natural = 0
     #: Engine that runs the worker processes: `local`, on this machine, or `ray`, on a Ray cluster (at RAY_ADDRESS,
