@@ -109,6 +109,12 @@ def assert_same(first: TensorDictBase, second: TensorDictBase) -> None:
         torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True, msg=str(key))
 
 
+def hashed(td: TensorDictBase) -> TensorDictBase:
+    """Actions of each branch, a function of its slot alone."""
+    slots = torch.arange(td.shape[-1]).float()[:, None]
+    return td.set("action", (slots * 12.9898 + td["place"].sum(-1, keepdim=True) * 0).sin())
+
+
 class Mass(EnvBase):
     """Points x' = x + 0.5 (v + action), whose episode is over beyond a limit; they can come back in, if not sticky.
 

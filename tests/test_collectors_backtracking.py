@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -11,10 +12,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
+from torchrl import envs
 
-from helpers_collectors import ACTION, STREAM, Policy, Walk, X, assert_same, distance, give_streams, starts
-from symphony.collectors import Backtrack, BeamSearchCollector, KeepAll, beam_search, with_rows
+from helpers_collectors import ACTION, STREAM, Mass, Policy, Walk, X, assert_same, distance, give_streams, starts
+from symphony.collectors import Backtrack, BeamSearchCollector, KeepAll, KeyScore, beam_search, branch, with_rows
 
 STATE = [STREAM, "step", X]
 OUTCOME = [("next", *key) if isinstance(key, tuple) else ("next", key) for key in STATE]
@@ -181,6 +184,32 @@ def test_what_can_not_be_right_is_refused():
             Backtrack(0.0, **wrong)
     with pytest.raises(ValueError, match="threshold is a number"):
         Backtrack(math.nan)
+
+
+def test_who_has_ended_stays_so_where_others_go_back():
+    """Agent 0 leaves in the first step; agent 1 is bad at steps 5 and 6 until the line has gone back."""
+    start = branch(with_rows(Mass(agents=2), [1]).reset(), 1)
+    start["agents", "place"] = torch.tensor([[[[1.45, 0.5], [0.0, 0.0]]]])
+    calls = itertools.count(1)
+
+    def score(td: TensorDictBase) -> Tensor:
+        bad = next(calls) in {5, 6}
+        return torch.tensor([0.1, 9.0 if bad else 0.1]).expand(*td.shape, 2)
+
+    actions = torch.tensor([[-0.6], [0.0]])
+    still = TensorDictModule(lambda x: actions.expand(*x.shape[:-1], 1), [("agents", "place")], [ACTION])
+    found = beam_search(Mass(agents=2), still, score, start, steps=8, prune_every=2, rule=Backtrack(5.0, back=(1,)))
+    assert next(calls) > 9
+    torch.testing.assert_close(found.scores[0, 0, :, 0], torch.tensor([0.1, *[0.0] * 7]))
+
+
+@pytest.mark.filterwarnings("ignore:Nested TransformedEnvs:UserWarning")
+@pytest.mark.parametrize("rows", [(), (3,)])
+def test_random_actions_go_back_too(rows):
+    env = envs.TransformedEnv(with_rows(Mass(), rows) if rows else Mass(), envs.StepCounter())
+    how = {"branches": 4, "leaves": 4, "prune_every": 2, "rule": Backtrack(-9.0)}
+    how["frames_per_batch"] = 4 * 6 * math.prod(rows)
+    assert BeamSearchCollector(env, score=KeyScore("reward", negate=True), **how).next().shape == (*rows, 4, 6)
 
 
 def test_as_a_collector():

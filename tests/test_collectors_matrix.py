@@ -15,17 +15,19 @@ from torchrl import envs, modules
 from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
-from helpers_collectors import Mass
+from helpers_collectors import Mass, hashed
 from symphony.collectors import (
     BeamSearchCollector,
     BeamSearchPlanner,
     KeepAll,
     KeepBest,
     KeyScore,
+    Systematic,
     beam_search,
     branch,
     with_rows,
 )
+from symphony.collectors import planner as planner_module
 
 ROWS, STEPS = 3, 8
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore:.*VecNormV2:FutureWarning")
@@ -190,12 +192,6 @@ def test_what_can_not_be_right_is_refused():
 HORIZON, BRANCHES = 6, 8
 
 
-def hashed(td: TensorDictBase) -> TensorDictBase:
-    """Actions of each branch, a function of its slot alone."""
-    slots = torch.arange(td.shape[-1]).float()[:, None]
-    return td.set("action", (slots * 12.9898 + td["place"].sum(-1, keepdim=True) * 0).sin())
-
-
 def returns(env: envs.EnvBase, start: TensorDictBase, value: Any = None) -> tuple[Tensor, Tensor]:
     """Return each slot's return of its constant action, and that action."""
     now, total = start.unsqueeze(-1).expand(*start.shape, BRANCHES).clone(), 0.0
@@ -229,6 +225,19 @@ def test_without_pruning_it_is_the_best_of_all_branches(valued, limit):
     torch.testing.assert_close(planned["planner", "weight"], torch.softmax(expected / 0.5, -1))
     torch.testing.assert_close(planned["planner", "value"].squeeze(-1), expected.amax(-1))
     torch.testing.assert_close(planned["planner", "action"], actions)
+
+
+@pytest.mark.parametrize("rule", [KeepBest(), Systematic(temperature=5.0)])
+def test_the_best_branch_is_that_of_the_highest_return(rule, monkeypatch):
+    """Also where the rule sees less than all of it."""
+    start, searched = with_rows(Mass(limit=9.0), [ROWS]).reset(), list[Any]()
+    spy = lambda *args, **how: searched.append(beam_search(*args, **how)) or searched[0]  # noqa: E731
+    monkeypatch.setattr(planner_module, "beam_search", spy)
+    how = {"policy": hashed, "rule": rule, "prune_every": 2, "noise": lambda td, n: torch.full((*td.shape, n), 0.3)}
+    planned = BeamSearchPlanner(Mass(limit=9.0), HORIZON, BRANCHES, **how)(start)
+    found = -searched[0].leaf_totals.sum(-2)
+    torch.testing.assert_close(planned["planner", "value"].squeeze(-1), found.amax(-1))
+    torch.testing.assert_close(found[:, 0], found.amax(-1))
 
 
 def test_the_last_period_of_an_episode_is_the_last_of_its_row():

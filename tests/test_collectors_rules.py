@@ -14,13 +14,12 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from helpers_collectors import Mass
+from helpers_collectors import Mass, hashed
 from symphony import collectors
 from symphony.collectors.rules import checked
 
 STEPS, KEPT, SPREAD = 8, 0.9, 0.5
 TOTAL = collectors.Aggregate("sum")
-SCHEMES = (collectors.Systematic, collectors.Stratified, collectors.Residual)
 
 
 class Filtered(EnvBase):
@@ -67,7 +66,7 @@ def observed(rows: int) -> tuple[Tensor, Tensor, Tensor]:
 def filtered(y: Tensor, rule: Any, branches: int, **how: Any) -> collectors.BeamSearchResult:
     rows, zero = len(y), torch.zeros(len(y), 1)
     start = TensorDict({"x": zero, "t": zero.long(), "y": y}, [rows])
-    noise = torch.rand(rows, STEPS, *([branches] if rule.noise_per_slot else []))
+    noise = torch.rand(rows, STEPS)
     how |= {"steps": STEPS, "prune_every": 1, "keep": [("next", "x")], "aggregate": TOTAL}
 
     def policy(td: TensorDictBase) -> TensorDictBase:
@@ -78,12 +77,11 @@ def filtered(y: Tensor, rule: Any, branches: int, **how: Any) -> collectors.Beam
 
 
 @pytest.mark.parametrize("threshold", [1.0, 0.5, 0.0])
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_the_evidence_is_that_of_kalmans_filter(scheme, threshold):
+def test_the_evidence_is_that_of_kalmans_filter(threshold):
     torch.manual_seed(0)
     y, evidence, mean = observed(40)
     y, evidence, mean = (part.repeat_interleave(10, 0) for part in (y, evidence, mean))
-    found = filtered(y, scheme(threshold=threshold), 128, prune_last=False)
+    found = filtered(y, collectors.Systematic(threshold=threshold), 128, prune_last=False)
     assert found.log_evidence is not None
     assert found.leaf_log_weights is not None
     assert found.sample_size is not None
@@ -119,10 +117,10 @@ def test_a_value_looks_ahead_without_a_bias():
     assert abs(float(ratio.mean()) - 1) < 4 * float(ratio.std()) / math.sqrt(len(ratio))
 
 
-@pytest.mark.parametrize("rule", [collectors.Stratified(threshold=0.5), collectors.KeepBest()], ids=repr)
+@pytest.mark.parametrize("rule", [collectors.Systematic(threshold=0.5), collectors.KeepBest()], ids=repr)
 def test_weights_are_in_the_batch(rule):
     how = {"branches": 4, "leaves": 4, "prune_every": 3, "aggregate": TOTAL, "frames_per_batch": 96}
-    score, weighs = collectors.KeyScore("reward", negate=True), isinstance(rule, collectors.Stratified)
+    score, weighs = collectors.KeyScore("reward", negate=True), isinstance(rule, collectors.Systematic)
     env = collectors.with_rows(Mass(), [3])
     collector = collectors.BeamSearchCollector(env, score=score, rule=rule, **how)
     fake, batch = collector.fake_tensordict(), collector.next()
@@ -164,6 +162,48 @@ def test_what_follows_an_end_changes_nothing(rule, agents, time):
     assert found(True, 1e4, until_done=False).scores.max() == 1e4
 
 
+def test_a_value_is_zero_where_all_have_terminated_one_after_the_other():
+    """Agent 0 is out after step 1 and in again after step 2, when agent 1 is out."""
+    start = collectors.branch(collectors.with_rows(Mass(agents=2), [1]).reset(), 1)
+    start["agents", "place"] = torch.tensor([[[[1.4, 0.7], [1.0, 0.6]]]])
+
+    def policy(td: TensorDictBase) -> TensorDictBase:
+        return td.set(("agents", "action"), torch.tensor([[-1.0], [0.0]]).expand(*td.shape, 2, 1))
+
+    how: dict[str, Any] = {"steps": 3, "prune_every": 3, "value": lambda td: torch.full(td.shape, 5.0)}
+    score = collectors.KeyScore(("agents", "reward"))
+    each = [Mass(agents=2, sticky=sticky, limit=1.45) for sticky in (False, True)]
+    loose, lasting = (collectors.beam_search(env, policy, score, start, **how).leaf_costs for env in each)
+    assert torch.equal(loose, lasting)
+
+
+def test_ends_change_nothing_where_they_are_not_to():
+    """Neither a start that is done nor a step that is leaves anything out."""
+    score, rows = collectors.KeyScore("reward", negate=True), collectors.with_rows(Mass(limit=0.6), [5])
+    here = collectors.branch(rows.reset(), 4)
+    how: dict[str, Any] = {"steps": 4, "prune_every": 2, "prune_last": False, "value": lambda td: td["place"].sum(-1)}
+    starts = here, here.clone().set("done", torch.ones_like(here["done"]))
+    found = [collectors.beam_search(Mass(), hashed, score, each, until_done=False, **how) for each in starts]
+    assert torch.equal(found[0].parents, found[1].parents)
+    assert torch.equal(found[0].leaf_costs, found[1].leaf_costs)
+    how = {"branches": 2, "frames_per_batch": 40, "until_done": False}
+    batch = collectors.BeamSearchCollector(rows, hashed, score=score, **how).next()
+    assert batch["next", "done"].any()
+    assert batch["collector", "mask"].all()
+
+
+@pytest.mark.parametrize("threshold", [1.0, 0.0])
+def test_a_total_that_is_not_a_number_weighs_nothing(threshold):
+    start = collectors.branch(collectors.with_rows(Mass(limit=9.0), [3]).reset(), 4)
+
+    def score(td: TensorDictBase) -> Tensor:
+        return torch.where(torch.arange(4) > 0, -td["reward"][..., 0], torch.nan)
+
+    how = {"rule": collectors.Systematic(threshold=threshold), "noise": torch.rand(3, 3), "aggregate": TOTAL}
+    found = collectors.beam_search(Mass(limit=9.0), hashed, score, start, steps=3, prune_every=1, **how)
+    assert all(part.isfinite().all() for part in (found.log_evidence, found.sample_size, found.leaf_log_weights))
+
+
 @given(st.integers(1, 6), st.integers(0, 1000))
 def test_a_total_is_that_of_the_steps_that_count(length, seed):
     scores = torch.randn(3, 6, 2, generator=torch.Generator().manual_seed(seed))
@@ -188,30 +228,26 @@ def test_keep_best_keeps_the_lowest(totals, fraction):
     assert parents == [kept[i % len(kept)] for i in range(len(totals))]
 
 
-@given(st.lists(ODD, min_size=1, max_size=12), st.lists(NOISE, min_size=12, max_size=12), st.floats(0.01, 100))
+@given(st.lists(ODD, min_size=1, max_size=12), NOISE, st.floats(0.01, 100))
 def test_copies_are_proportional(totals, noise, temperature):
-    """A branch of weight w gets as many copies of S w as its scheme promises; the best that goes on is in slot 0."""
+    """A branch of weight w gets S w copies, rounded; the best that goes on is in slot 0."""
     given_totals = torch.tensor([totals])
-    for scheme in SCHEMES:
-        numbers = [noise[: len(totals)]] if scheme is collectors.Stratified else noise[:1]
-        parents = scheme(temperature)(given_totals, torch.tensor(numbers).double())[0]
-        counts = torch.bincount(parents, minlength=len(totals))
-        assert len(counts) == len(totals)
-        if all(map(math.isfinite, totals)):
-            share = len(totals) * torch.softmax(-given_totals[0].double() / temperature, 0)
-            assert (counts >= (share - 1e-6).floor()).all() or scheme is collectors.Stratified
-            assert (counts <= (share + 1e-6).ceil() + (scheme is not collectors.Systematic)).all()
-            assert (given_totals[0][parents].diff() >= 0).all()
-        finite = {i for i, total in enumerate(totals) if total < math.inf}
-        assert not finite or set(parents.tolist()) <= finite
+    parents = collectors.Systematic(temperature)(given_totals, torch.tensor([noise]).double())[0]
+    counts = torch.bincount(parents, minlength=len(totals))
+    assert len(counts) == len(totals)
+    if all(map(math.isfinite, totals)):
+        share = len(totals) * torch.softmax(-given_totals[0].double() / temperature, 0)
+        assert (counts >= (share - 1e-6).floor()).all()
+        assert (counts <= (share + 1e-6).ceil()).all()
+        assert (given_totals[0][parents].diff() >= 0).all()
+    finite = {i for i, total in enumerate(totals) if total < math.inf}
+    assert not finite or set(parents.tolist()) <= finite
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_copies_are_fair(scheme):
+def test_copies_are_fair():
     totals = torch.tensor([0.3, 2.0, 0.1, 0.9, 0.3])
     torch.manual_seed(0)
-    noise = torch.rand(20000, *([5] if scheme is collectors.Stratified else []))
-    parents = scheme(0.7)(totals.expand(20000, 5), noise)
+    parents = collectors.Systematic(0.7)(totals.expand(20000, 5), torch.rand(20000))
     average = torch.bincount(parents.flatten(), minlength=5) / 20000
     torch.testing.assert_close(average, 5 * torch.softmax(-totals / 0.7, 0), atol=0.02, rtol=0)
 

@@ -84,6 +84,12 @@ def test_weights_of_rollouts_make_a_policy_gradient():
     torch.testing.assert_close(weighted[1], plain + ((weight - 1) * each)[rollout].mean())
     with pytest.raises(ValueError, match="weight"):
         loss(td.clone().set(("agents", "weight"), weight[:, :1]))
+    # Whoever selects what the loss reads keeps them; those of other entries need not be numbers.
+    td = td.set(("agents", "weight"), weight.masked_fill(~rollout, torch.nan))
+    out = loss(td.select(*loss.in_keys))
+    torch.testing.assert_close(out["loss_distillation"], weighted[1])
+    out["loss_distillation"].backward()
+    assert all(p.grad.isfinite().all() for p in loss.parameters())
 
 
 def test_more_rollouts_weigh_no_more_and_a_kind_that_is_absent_adds_nothing():

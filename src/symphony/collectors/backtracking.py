@@ -149,7 +149,7 @@ def follow(
             those = torch.where(ending, total(judged, short)[:, 0], those)
             worst = torch.where(ending[:, None], counted[:, :short].amax(1), worst)
         simulated = simulated + every * len(line) - ending.sum() * (every - short)
-        alive = run.alive.any(-1)
+        alive = run.alive
         if history is None:
             nowhere = line.new_zeros(lines * length)
             history = take(run.records[0], nowhere)
@@ -163,12 +163,13 @@ def follow(
             all_alive.index_copy_(0, place + k, alive[:, 0, k])
         all_totals.index_copy_(0, line * periods + at, totals)
         # An episode that has ended can't be bad any more; a line that goes back goes to before its end.
-        bad = ~(those <= rule.threshold) & alive[:, 0, 0] & ~excused.all(-1)
+        bad = ~(those <= rule.threshold) & alive[:, 0, 0].any(-1) & ~excused.all(-1)
         goes = course.judge(line, bad, ~(worst < worst.amax(-1, keepdim=True))).nonzero().squeeze(-1)
-        now, over = run.after.select(*entries), run.ended.index_fill(0, goes, False)
+        now, over = run.after.select(*entries), run.ended
         if len(goes):
             who = line[goes]
-            root = take(history.exclude("next"), ((who * periods + course.at[who]) * every)[:, None])
+            first = ((who * periods + course.at[who]) * every)[:, None]
+            root, over = take(history.exclude("next"), first), over.index_copy(0, goes, ~all_alive[first])
             root = root if rule.renew is None else rule.renew(root, course.times[who])
             now = _with_rows(now, goes, root, entries)
         on = (course.at[line] < periods).nonzero().squeeze(-1)
@@ -184,7 +185,7 @@ def follow(
     return (
         take(history, order),
         take_values(all_scores, order, 1),
-        take_values(all_alive, order, 1),
+        take_values(all_alive, order, 1).any(-1),
         all_totals.reshape(*start.shape, periods).transpose(-1, -2),
         int(simulated),
     )

@@ -54,9 +54,10 @@ class BeamSearchResult:
         tree: [*b, S, T] all simulated steps by slot, if asked for.
         prune_every: T_p; the last period may be shorter.
         simulated_steps: branch-steps that were simulated.
-        leaf_costs: [*b, L] what the rule saw of the leaves in the last period in which their row had not ended.
+        leaf_costs: [*b, L] what the rule saw of the leaves in the last period in which their row had not ended; with
+            ``accumulate`` the totals of their whole histories, and their values.
         log_weights: [*b, P, S] before each pruning, minus the totals since the row was last resampled, by the
-            temperature; None unless the rule is a :class:`Resampling`, like the following.
+            temperature; None unless the rule is a :class:`Systematic`, like the following.
         leaf_log_weights: [*b, L] those after the last pruning, relative to the mean weight; 0 where it resampled.
         log_evidence: [*b] estimate of the logarithm of the mean weight of unpruned branches, whose exponential has no
             bias: of the evidence, where totals are negative log-likelihoods and the temperature is 1.
@@ -107,7 +108,7 @@ def beam_search(
     accumulate: bool = False,
     prune_last: bool = True,
     until_done: bool = True,
-    noise: Float[Tensor, "*b P"] | Float[Tensor, "*b P S"] | None = None,
+    noise: Float[Tensor, "*b P"] | None = None,
     slot_keys: Sequence[NestedKey] = (),
     group_key: NestedKey | None = None,
     keep: Sequence[NestedKey] | None = None,
@@ -173,7 +174,7 @@ def beam_search(
     # One program for lines that go back, also when the last of them are few.
     width = min(rule.width or start.numel(), start.numel()) if isinstance(rule, Backtrack) else 0
     simulation = Simulation(env, whole, *how, width if compile_step else 0)
-    ended = _ended(env, start, start.ndim)
+    ended = _ended(env, start, start.ndim) & until_done
     with set_exploration_type(exploration_type), branched_specs(policy, start.shape[:-1], start.shape):
         if isinstance(rule, Backtrack):
             if leaves not in (None, branches):
@@ -211,6 +212,8 @@ def beam_search(
     last_period = (torch.stack(pruning.active, -1).sum(-1) - 1).clamp_min(0)[..., None, None]
     costs, named = (part.take_along_dim(last_period, -2).squeeze(-2) for part in (seen, slots))
     costs = costs.gather(-1, named)
+    if accumulate:  # of which a rule that weighs sees a part
+        costs = totals.gather(-1, slots).sum(-2) + (0.0 if worth is None else worth.gather(-1, slots[..., -1, :]))
     if leaves is not None:
         best = ranking(costs, named)[..., :leaves]
         slots, costs = slots.take_along_dim(best[..., None, :], -1), costs.gather(-1, best)
@@ -305,8 +308,10 @@ class Simulation:
             last = (~over[..., 1:]).sum(-1).clamp_max(steps - 1)
             first = torch.arange(0, last.numel() * steps, steps, device=last.device).reshape(last.shape)
             came = take(TensorDict.stack(states, last.ndim), first + last)
-        terminated = _ended(self.env, came, over.ndim - 1, "terminated").all(-1)
-        return torch.where(terminated, 0.0, value(came))
+        # The flag of one that ended may not last; what follows the end of all does not count.
+        each = torch.stack([_ended(self.env, state, over.ndim - 1, "terminated") for state in states], -2)
+        terminated = (each & ~over[..., :-1, None]).any(-2) | _ended(self.env, came, over.ndim - 1, "terminated")
+        return torch.where(terminated.all(-1), 0.0, value(came))
 
     def total(self, run: Run, length: int | None = None) -> Float[Tensor, "*b S"]:
         """Return the totals of a period, or of its first steps alone."""

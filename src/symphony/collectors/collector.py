@@ -36,7 +36,7 @@ class BeamSearchCollector(Collector):
     - ``("collector", "beam_slot")`` [..., T] int64: slot in which the step was simulated,
     - ``("collector", "mask")`` [..., T] bool: False after the end of an episode; TorchRL's losses leave such steps
       out. With ``trajs_per_batch`` they are dropped.
-    - with a :class:`Resampling` rule, ``("collector", "log_weight")`` [..., T]: of the leaf, relative to the mean
+    - with the rule :class:`Systematic`, ``("collector", "log_weight")`` [..., T]: of the leaf, relative to the mean
       weight of its tree. Losses may weight leaves by its exponential.
     - with `keep_tree`, ``"tree"``, a TensorDict [*env.batch_size, S, T] of all simulated steps, by slot, pruned
       branches included, with their ``("collector", "beam_score")``.
@@ -142,7 +142,8 @@ class BeamSearchCollector(Collector):
         if self.compact_obs:
             states = (*self.env.observation_keys, *self.env.state_keys)
             leaves = leaves.exclude(*(below(key) for key in states))
-        ended = torch.stack([leaves.get(key).flatten(leaves.ndim).any(-1) for key in self._done]).any(0)
+        flags = [leaves.get(key).flatten(leaves.ndim).any(-1) for key in self._done]
+        ended = torch.stack(flags).any(0) & self._search["until_done"]
         extras = {
             "beam_score": found.scores,
             "beam_total": totals.transpose(-1, -2)[..., period],
@@ -190,8 +191,8 @@ class BeamSearchCollector(Collector):
         buffer, policy = self.replay_buffer, self._wrapped_policy
         seen = self.stats()["frames"] if buffer is None else buffer.write_count
         if isinstance(policy, RandomPolicy) or seen < (self.init_random_frames or 0):
-            # The specs of a random policy have the rows of the collector's environment, but no branches.
-            return branched_env(self.env, (*self.env.batch_size, self.branches)).rand_action
+            # The specs of a random policy have neither branches nor the lines that go back.
+            return lambda td: branched_env(self.env, td.shape).rand_action(td)
         if self.policy_device is None or self.policy_device == self.env_device:
             return policy
 
@@ -204,12 +205,11 @@ class BeamSearchCollector(Collector):
         return elsewhere
 
     def rule_noise(self, start: TensorDictBase) -> Float[Tensor, "*_"]:
-        """Return numbers in [0, 1) for the pruning rule [*env.batch_size, P] (or [..., P, S]), given the start."""
+        """Return numbers in [0, 1) for the pruning rule [*env.batch_size, P] , given the start."""
         periods = -(-self.frames_per_batch // self.prune_every)
         if self._rule_noise is not None:
             return self._rule_noise(start, periods)
-        slots = start.shape[-1:] if getattr(self._rule, "noise_per_slot", False) else ()
-        return torch.rand((*start.shape[:-1], periods, *slots), generator=self._rng).to(self.env_device)
+        return torch.rand((*start.shape[:-1], periods), generator=self._rng).to(self.env_device)
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed the environment and the noise of the pruning rule; return the next seed."""

@@ -15,8 +15,7 @@ from torch import Tensor
 PruningRule = Callable[..., Tensor]
 """Any callable ``rule(totals, noise) -> parents``: totals [*b, S] float, where a *high* number is bad; noise [*b] in
 [0, 1) or None, by which alone it may draw; parents [*b, S] int64, the branch that each slot is continued from. One
-with ``takes_groups = True`` is called with groups [*b, S] (or None), too, and decides what they mean; one with
-``noise_per_slot = True`` gets noise [*b, S].
+with ``takes_groups = True`` is called with groups [*b, S] (or None), too, and decides what they mean.
 """
 
 
@@ -165,10 +164,10 @@ class KeepAll:
 
 
 @dataclass(frozen=True)
-class Resampling:
-    """Resampling with weights softmax(-totals / temperature), as in particle filters; subclasses draw the copies.
+class Systematic:
+    """Systematic resampling with weights softmax(-totals / temperature), as in particle filters.
 
-    A branch of weight w gets S w copies on average over the noise, and slot 0 holds the best that goes on. What the
+    A branch of weight w gets floor(S w) or ceil(S w) copies, and slot 0 holds the best that goes on. What the
     rule sees are the totals since a row was last resampled.
 
     Args:
@@ -181,7 +180,6 @@ class Resampling:
 
     temperature: float = 1.0
     threshold: float = 1.0
-    noise_per_slot: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not self.temperature > 0.0:
@@ -199,44 +197,12 @@ class Resampling:
         ranked = totals.argsort(dim=-1, stable=True)
         weights = torch.softmax(self._logits(totals.gather(-1, ranked)), -1)
         slots = torch.arange(totals.shape[-1], device=totals.device)
-        shift = noise.double() if self.noise_per_slot else noise.double()[..., None]
-        return ranked.gather(-1, self._copies(weights, slots, shift))
+        return ranked.gather(-1, _at(weights, (slots + noise.double()[..., None]) / len(slots)))
 
     def _logits(self, totals: Float[Tensor, "*b S"]) -> Float[Tensor, "*b S"]:
         # float64: in float32 the last of many cumulated weights may stay visibly below one.
         worst = torch.finfo(torch.float64).min / 4
         return (-totals.double() / self.temperature).nan_to_num(nan=worst, neginf=worst, posinf=-worst)
-
-    def _copies(
-        self, weights: Float[Tensor, "*b S"], slots: Int[Tensor, " S"], shift: Float[Tensor, "*b _"]
-    ) -> Int[Tensor, "*b S"]:
-        """Return the ranks that the slots continue from, ascending."""
-        return _at(weights, (slots + shift) / len(slots))
-
-
-class Systematic(Resampling):
-    """Systematic resampling (Kitagawa 1996): a branch of weight w gets floor(S w) or ceil(S w) copies."""
-
-
-class Stratified(Resampling):
-    """Stratified resampling: one number for each slot, from a part of the weights of its own; noise is [*b, S]."""
-
-    noise_per_slot: ClassVar[bool] = True
-
-
-class Residual(Resampling):
-    """Residual resampling: floor(S w) copies for sure, the others drawn systematically from what is left."""
-
-    def _copies(
-        self, weights: Float[Tensor, "*b S"], slots: Int[Tensor, " S"], shift: Float[Tensor, "*b _"]
-    ) -> Int[Tensor, "*b S"]:
-        share = len(slots) * weights
-        sure = share.floor()
-        first = sure.sum(-1, keepdim=True)
-        place = slots.double().expand(weights.shape).contiguous()
-        certain = torch.searchsorted(sure.cumsum(-1), place, right=True).clamp_max(len(slots) - 1)
-        points = ((place - first + shift) / (len(slots) - first).clamp_min(1)).clamp(0, 1)
-        return torch.where(place < first, certain, _at(share - sure, points)).sort(-1).values
 
 
 def _at(weights: Float[Tensor, "*b S"], points: Float[Tensor, "*b S"]) -> Int[Tensor, "*b S"]:
@@ -320,14 +286,13 @@ class Pruning:
         accumulate: bool,
     ) -> None:
         self.rule, self.accumulate = rule, accumulate
-        self.weighs = rule if isinstance(rule, Resampling) else None
+        self.weighs = rule if isinstance(rule, Systematic) else None
         self._groups = None if group_key is None else _groups(start, group_key)
         if group_key is not None and not takes_groups(rule):
             raise ValueError(f"{rule} takes no groups: group_key is for a rule that takes groups")
         self._noises: Sequence[Tensor | None] = [None] * periods
         if noise is not None:
-            slots = start.shape[-1:] if getattr(rule, "noise_per_slot", False) else ()
-            shape = [*start.shape[:-1], periods, *slots]
+            shape = [*start.shape[:-1], periods]
             if list(noise.shape) != shape:
                 raise ValueError(f"noise must be {shape}, is {list(noise.shape)}")
             self._noises = noise.unbind(start.ndim - 1)
@@ -354,7 +319,7 @@ class Pruning:
         slots = torch.where(moves[..., None], parents, _slots(seen))
         self._groups = None if self._groups is None else self._groups.gather(-1, slots)
         if self.weighs is not None:
-            weights = -seen.double() / self.weighs.temperature
+            weights = self.weighs._logits(seen)
             self.log_weights.append(weights)
             self._gained.append(torch.where(moves, _log_mean(weights), 0.0))
             # What branches were chosen for in advance is taken back, or it would count again when it comes.
@@ -372,7 +337,7 @@ class Pruning:
         """Return log-weights of the slots after the last pruning, relative to their mean, and the log-evidence."""
         if self.weighs is None or self._carried is None:
             return None, None
-        weights = -self._carried.double() / self.weighs.temperature
+        weights = self.weighs._logits(self._carried)
         mean = _log_mean(weights)
         return weights - mean[..., None], torch.stack(self._gained).sum(0) + mean
 
@@ -398,7 +363,7 @@ def checked(
     groups: Int[Tensor, "*b S"] | None = None,
 ) -> Int[Tensor, "*b S"]:
     """Return the branch that each slot continues from; ValueError if a rule fails or returns anything else."""
-    own = isinstance(rule, KeepAll | KeepBest | Resampling | ReplaceBad)
+    own = isinstance(rule, KeepAll | KeepBest | Systematic | ReplaceBad)
     try:
         parents = rule(totals, noise, groups) if takes_groups(rule) else rule(totals, noise)
         what = f"{parents.dtype} {tuple(parents.shape)}"

@@ -313,7 +313,7 @@ class DistillationLoss(ActorLoss):
     losses = ("loss_distillation", "nll_expert", "nll_rollout")
 
     def _read_keys(self) -> list[NestedKey]:
-        return [*super()._read_keys(), self.tensor_keys.rollout]
+        return [*super()._read_keys(), self.tensor_keys.rollout, self.tensor_keys.weight]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -324,7 +324,7 @@ class DistillationLoss(ActorLoss):
         expert, rollout = fit.counted & ~rollout, fit.counted & rollout
         cost = fit.cost
         if tensordict.get(self.tensor_keys.weight, None) is not None:
-            cost = cost * self._entries(tensordict, self.tensor_keys.weight, "weight", shape)
+            cost = cost * self._entries(tensordict, self.tensor_keys.weight, "weight", shape).where(rollout, 1.0)
         reduction: Reduction = "none" if self.reduction == "none" else "mean"
         nll = [self._reduced(fit.nll, kind, reduction) for kind in (expert, rollout)]
         loss = self._reduced(fit.cost, expert) + self._reduced(cost, rollout)
