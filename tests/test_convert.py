@@ -130,6 +130,13 @@ def test_bad_arguments_are_named(logs: Write, out: Path) -> None:
     assert left(out) == []
 
 
+def test_an_output_may_be_a_link(logs: Write, tmp_path: Path) -> None:
+    (place := tmp_path / "place").mkdir()
+    (link := tmp_path / "link").symlink_to(place)
+    convert(FakeReader(), [logs("a.scene", "straight 1")], link, interactive=1)
+    assert len(SegmentStore(place)) == len(SegmentStore(link)) == 1
+
+
 def test_directories_are_searched(logs: Write, tmp_path: Path) -> None:
     paths = [logs("b.scene"), logs("deep/a.scene"), logs("c.scene-00001-of-00009"), logs("a.txt")]
     patterns = FakeReader.patterns
@@ -214,7 +221,13 @@ def test_the_report_of_a_merged_store_joins_those_of_its_parts(tmp_path: Path) -
 def test_the_same_segment_twice_another_time_step_and_what_is_there_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="in the store already"):
         merge([PARTS[0], PARTS[0]], tmp_path / "twice")
-    assert not (tmp_path / "twice").exists()
+    assert not list(tmp_path.iterdir())
+    with StoreWriter(tmp_path / "damaged") as writer:
+        writer.copy(SegmentStore(PARTS[1]), 0)
+    column = tmp_path / "damaged/columns/lanes.points.bin"
+    column.write_bytes(bytes([column.read_bytes()[0] ^ 1]) + column.read_bytes()[1:])
+    with pytest.raises(DataError, match="damaged: a map does not match its hash"):
+        merge([tmp_path / "damaged", PARTS[0]], tmp_path / "both")
     store = SegmentStore(PARTS[0])
     with StoreWriter(tmp_path / "slow") as writer:
         writer.append(store[0].replace(dt=0.1, segment_id="slow"))

@@ -33,6 +33,7 @@ from symphony.data.selection import MOVING, exclusion, interactive_agents, trave
 from symphony.data.sources import sumo
 from symphony.data.sources.sumo import process
 from symphony.data.sources.sumo.networks import own_network, slow_bends, town
+from symphony.data.sources.sumo.process import run_program
 from symphony.data.sources.sumo.roads import read_network
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
@@ -472,6 +473,26 @@ def test_streets_of_openstreetmap_are_driven_and_footways_are_not(tmp_path: Path
     network = read_network(own_network(file, tmp_path))
     assert (len(network.centers), len(network.sources())) == (1, 4)
     assert driven_length(tmp_path / "net.net.xml") == pytest.approx(4 * 600, rel=0.1)
+
+
+@needs_sumo
+@pytest.mark.parametrize("more", ["lefthand 1", "bikelanes.guess 1", "crossings.guess 1 --walkingareas 1"])
+def test_only_lanes_for_cars_count_on_either_side_of_the_road(tmp_path: Path, more: str) -> None:
+    grid = "--grid --grid.number 3 --grid.length 120 --default.lanenumber 2 --sidewalks.guess true"
+    run_program("netgenerate", f"{grid} --output-file g.net.xml --{more}", tmp_path)
+    file = tmp_path / "g.net.xml"
+    file.write_text(file.read_text().replace('disallow="pedestrian', 'disallow="truck bus pedestrian'))
+    assert generate(Plan(1, kinds=(str(file),)), tmp_path / "store").complete
+    (segment,) = SegmentStore(tmp_path / "store")
+    assert segment.road.lane_width == pytest.approx(3.2)
+    check_segments([segment])
+
+
+@needs_sumo
+def test_opendrive_of_those_who_drive_on_the_left_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "left.xodr").write_text('<OpenDRIVE><road rule="LHT" id="1"/></OpenDRIVE>')
+    with pytest.raises(DataError, match="drives on the left"):
+        own_network(tmp_path / "left.xodr", tmp_path)
 
 
 @needs_sumo

@@ -197,6 +197,17 @@ def test_broken_scenarios_are_refused_by_name(path: str, value: Any, field: str,
     assert error.segment == (None if path == "id" else "scene-0001")
 
 
+def test_what_holds_itself_many_times_is_no_word(tmp_path: Path) -> None:
+    """Written out it would take all memory."""
+    value: Any = []
+    for _ in range(60):
+        value = [value, value]
+    tree = changed("metadata/dataset", value)
+    tree["tracks"]["ego"]["type"] = tree["map_features"]["on"]["type"] = value
+    found = read_one("scenarionet", write(tmp_path, tree))
+    assert found.agent_type[found.ego] == AgentType.OTHER
+
+
 @pytest.mark.parametrize("key", ["id", "map_features/\ud800"])
 def test_names_that_can_not_be_written_end_no_conversion(key: str, tmp_path: Path) -> None:
     tree = changed(key, "\ud800" if key == "id" else {"type": "STOP_SIGN"})

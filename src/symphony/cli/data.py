@@ -128,7 +128,7 @@ class Hardest(shared.Command):
         with shared.progress("looking at each") as advance:
             found = [one for _, one in hardest(opened(self.store), self.count, progress=advance)]
         told = shared.write_numbers(self.json, [{**asdict(one), "score": one.score} for one in found])
-        if self.ids:
+        if self.ids and told:
             shared.say("\n".join(dict.fromkeys(one.segment for one in found)))
         elif told:
             rows = [["segment", "rollout", "critical", "TTC s", "PET s", "braking m/s²", "to the edge m"]]
@@ -149,7 +149,7 @@ class Convert(shared.Command):
     #: Format of the logs: Waymo Open Motion Dataset (TFRecord), CommonRoad (XML), Argoverse 2 motion
     #: forecasting (Parquet, each with its map beside it), INTERACTION (CSV with Lanelet2 maps), ScenarioNet (pickle).
     format: Positional[Literal["womd", "commonroad", "argoverse2", "interaction", "scenarionet"]]
-    #: Files of that format, or folders to search for them.
+    #: Files of that format, or folders to search for them (links in them are not followed).
     files: Annotated[Positional[shared.Paths], arg(metavar="FILE ...")]
     out: Path  # Folder of the store.
     rate: Positive = 5.0  # Steps per second in the store (the paper's 5).

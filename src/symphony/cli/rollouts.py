@@ -89,7 +89,7 @@ class View(shared.Command):
     folders: shared.SavedFolders
     #: File to write: .html (a page), .png, .pdf, .svg, .gif or .mp4 (with the extra `video`); view.html in the first.
     out: shared.ResultFile = None
-    segments: shared.Segments = ()
+    segments: shared.Ids = ()
     rollouts: checks.Natural = 0  # Rollouts of a segment in a picture (0: all) or a film (0: one), at most.
 
     def __call__(self) -> None:
@@ -176,7 +176,7 @@ class Export(shared.Command):
     #: Format: CommonRoad scenarios (XML 2020a), JSON, OpenSCENARIO (XML 1.2), or MCAP for Foxglove (extra `mcap`).
     format: Literal["commonroad", "json", "openscenario", "mcap"] = "commonroad"
     out: shared.Folder = None  # Folder of the files; by default the folder `export` within SIM.
-    segments: shared.Segments = ()
+    segments: shared.Ids = ()
     #: Numbers of the rollouts to export of each run segment, counted from 0; by default all.
     rollouts: Annotated[tuple[int, ...], arg(metavar="K ...")] = ()
 

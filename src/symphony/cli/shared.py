@@ -34,6 +34,7 @@ SavedFolders = Annotated[Positional[Paths], checks.Bounds(distinct=True), arg(me
 Saved = Annotated[Positional[Path], arg(metavar="SIM", help="Folder of rollouts (`symphony simulate`).")]
 _SEGMENTS = "Ids of run segments, or their numbers in the store, to use no others."
 Segments = Annotated[tuple[str, ...], arg(metavar="ID ...", help=_SEGMENTS)]
+Ids = Annotated[tuple[str, ...], arg(metavar="ID ...", help="Ids of run segments, to use no others.")]
 _TRUST = "Run the code that the agent's folder names by import paths; without it such a folder is refused."
 TrustCode = Annotated[bool, arg(help=_TRUST)]
 Workers = Annotated[checks.Count, arg(help="Number of processes; it changes the speed, not the results.")]

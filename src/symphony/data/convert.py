@@ -209,7 +209,7 @@ def convert(
     ):
         if not least <= value <= most:
             raise ConfigError(f"{name} must be between {least:g} and {most:g}, is {value:g}")
-    out = Path(out).absolute()
+    out = Path(out).resolve()
     reader, options = _reader(reader, reader_options)
     settings = {"reader": reader.name, "rate": rate, "interactive": interactive, "smooth": smooth} | options
     flags = {"exclude_overlaps": exclude_overlaps, "hold_lights": hold_lights, "strict": strict}
@@ -431,10 +431,14 @@ def merge(paths: Sequence[Path], out: Path, progress: Told | None = None) -> Seg
     the store if ``out`` exists or is being made, a segment is in two stores, the generation of one is not finished,
     or stores differ in their time step.
     """
+    out, seen = out.resolve(), set[str]()
     if out.exists():
         raise DataError("exists already; choose another folder", file=out)
     stores = [SegmentStore(path) for path in paths]
     for store in stores:
+        if twice := seen.intersection(store.ids):
+            raise DataError(TWICE, file=store.path, segment=min(twice))
+        seen.update(store.ids)
         if store.unfinished is not None:
             raise DataError(store.unfinished, file=store.path)
     steps = {float(dt) for store in stores for dt in store.time_steps}

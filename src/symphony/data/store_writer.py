@@ -94,9 +94,12 @@ class StoreWriter(AbstractContextManager["StoreWriter"]):
         """
         record, values = store.raw(SEGMENTS, index)
         map_record, road = store.raw(MAPS, int(record["map"]))
+        digest = map_record["hash"].tobytes()
+        # Segments of other stores will share it.
+        if digest not in self._roads and content_hash(store.road(int(record["map"]))) != digest.hex():
+            raise DataError("a map does not match its hash: the store was damaged", file=store.path)
         scalars = {name: record[name] for name, *_ in SEGMENTS.scalars}
-        hashes = record["hash"].tobytes(), map_record["hash"].tobytes()
-        return self._write(store.ids[index], values, scalars, *hashes, lambda: road)
+        return self._write(store.ids[index], values, scalars, record["hash"].tobytes(), digest, lambda: road)
 
     def _write(
         self,

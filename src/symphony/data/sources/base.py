@@ -121,7 +121,8 @@ def readable(
         if found is not None:
             yield found
     except DataError as error:
-        odd.setdefault(kind, f"{error.field}: {error.message}")
+        # JSON may hold halves of letters, which no UTF-8 can.
+        odd.setdefault(kind, f"{error.field}: {error.message}".encode(errors="backslashreplace").decode())
 
 
 def refuse(wrong: object, message: str, field: str | None = None, *, file: object = None) -> None:

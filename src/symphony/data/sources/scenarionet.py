@@ -75,7 +75,7 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
     with located(field="metadata"):
         metadata = scenario["metadata"]
         times = _numbers(metadata["ts"], "ts", scenario["length"], 1)[:, 0]
-        steps, ego, dataset = len(times), metadata["sdc_id"], str(metadata.get("dataset", ""))
+        steps, ego, dataset = len(times), metadata["sdc_id"], _text(metadata.get("dataset"))
         place, date = metadata.get("map"), metadata.get("date", metadata.get("log_name"))
         refuse(not 2 <= steps <= schema.MAX_STEPS, f"{steps} steps, expected 2 … {schema.MAX_STEPS}")
         dt = base.time_step(times, "metadata: ts")
@@ -122,10 +122,14 @@ def _tracks(scenario: Mapping[Any, Any], steps: int) -> tuple[list[str], list[in
             valid = parts[0][:, 0] > 0
             states = np.where(valid[:, None], np.concatenate(parts[1:], axis=1), 0.0)
             if valid.any():
-                found.append((str(key), _TYPES.get(str(track.get("type")), AgentType.OTHER), states, valid))
+                found.append((str(key), _TYPES.get(_text(track.get("type")), AgentType.OTHER), states, valid))
     refuse(not found, "has no agents", "tracks")
     names, kinds, all_states, masks = zip(*found, strict=True)
     return list(names), list(kinds), np.stack(all_states), np.stack(masks)
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else ""  # not str(): what holds itself many times has no end
 
 
 def _numbers(value: Array, name: str, steps: Any, width: int) -> Doubles:
@@ -182,7 +186,7 @@ def _map(scenario: Mapping[Any, Any], dataset: str, origin: Doubles) -> tuple[Ro
         features = scenario["map_features"].items()
     for key, node in features:
         with located(field=f"map_features {str(key)[:60]}"):
-            kind = str(node.get("type"))
+            kind = _text(node.get("type"))
             line, area = (_points(node.get(name, ())) for name in ("polyline", "polygon"))
             if dataset == "nuscenes":
                 line = line[:, :2]  # the third number is a heading

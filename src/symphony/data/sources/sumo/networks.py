@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from symphony.data.sources.base import Doubles, load_xml, located, number
+from symphony.data.sources.base import Doubles, load_xml, located, number, refuse
 from symphony.data.sources.sumo.process import run_program
-from symphony.data.sources.sumo.roads import densify, shape
+from symphony.data.sources.sumo.roads import densify, for_cars, shape
 from symphony.errors import DataError
 
 COMMON = (
@@ -389,6 +389,7 @@ def _limited(root: ET.Element) -> ET.ElementTree[ET.Element]:
     """Return an OpenDRIVE map whose lanes without a speed limit have that of their road, which SUMO does not read."""
     for node in root.iter():
         node.tag = node.tag.rpartition("}")[2]
+    refuse(root.find("road[@rule='LHT']") is not None, "drives on the left, which is not supported", "rule")
     for road in root.iterfind("road"):
         limits = [(number(kind.get("s"), "type"), kind.find("speed")) for kind in road.iterfind("type")]
         for section in road.iterfind("lanes/laneSection"):
@@ -402,9 +403,11 @@ def _limited(root: ET.Element) -> ET.ElementTree[ET.Element]:
 
 
 def slow_bends(file: Path) -> None:
-    """Let SUMO drive the lanes of a network, which has limits for straight roads, as fast as their bends allow."""
+    """Let SUMO drive lorries, too, on lanes for cars, as fast as bends allow: their limits are for straight roads."""
     tree = ET.parse(file)  # noqa: S314 - written by netconvert
-    for lane in tree.iterfind("edge/lane"):
+    for lane in filter(for_cars, tree.iterfind("edge/lane")):
+        for rule in ("allow", "disallow"):
+            lane.attrib.pop(rule, None)
         line = densify(shape(lane.attrib["shape"]), BEND)
         lane.set("speed", f"{min(float(lane.attrib['speed']), _comfortable_speed(line)):.2f}")
     tree.write(file)

@@ -87,8 +87,14 @@ def shape(text: str) -> Doubles:
     return np.array([[float(c) for c in p.split(",")[:2]] for p in text.split()])
 
 
+def for_cars(lane: ET.Element) -> bool:
+    """Return whether cars may use a lane."""
+    allowed = {"all", "passenger"} & {*lane.get("allow", "all").split()}
+    return bool(allowed) and "passenger" not in lane.get("disallow", "").split()
+
+
 def read_network(file: Path) -> Network:
-    """Read a compiled network (``.net.xml``)."""
+    """Read a compiled network (``.net.xml``): its lanes for cars."""
     root = ET.parse(file).getroot()  # noqa: S314
     lanes: list[Doubles] = []
     width, speed, internal, edge, names = [], [], [], [], []
@@ -101,7 +107,8 @@ def read_network(file: Path) -> Network:
         if element.get("function") in {"crossing", "walkingarea"}:
             continue
         names.append(element.attrib["id"])
-        for lane in element.iter("lane"):
+        # From right to left, which is the other way round where people drive on the left.
+        for lane in list(filter(for_cars, element.iter("lane")))[:: -1 if root.get("lefthand") == "true" else 1]:
             index[lane.attrib["id"]] = len(lanes)
             lanes.append(shape(lane.attrib["shape"]))
             width.append(float(lane.get("width", _DEFAULT_WIDTH)))
@@ -111,8 +118,9 @@ def read_network(file: Path) -> Network:
     successors, stops = set(), set()
     connectors: dict[str, list[tuple[int, int, int]]] = {}
     for link in root.iter("connection"):
-        start = index[f"{link.attrib['from']}_{link.attrib['fromLane']}"]
-        end = index[f"{link.attrib['to']}_{link.attrib['toLane']}"]
+        start, end = (index.get(f"{link.attrib[which]}_{link.attrib[f'{which}Lane']}") for which in ("from", "to"))
+        if start is None or end is None:  # crossings, or lanes for others than cars
+            continue
         via = index[link.attrib["via"]] if "via" in link.attrib else end
         successors.add((start, via))
         if "tl" in link.attrib:
