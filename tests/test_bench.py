@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.special import betaincinv
 
 from helpers_segments import straight_road
-from helpers_store import brief, fill
+from helpers_store import brief, stored
 from symphony.bench import run as bench
 from symphony.bench.criticality import hardest
 from symphony.bench.measures import estimate, needed_groups
@@ -59,12 +59,7 @@ def fast(seen):
 def broken(seen):
     raise RuntimeError("no idea")
 """
-
-
-@pytest.fixture(scope="module")
-def roads(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found = [straight_road(2, steps=8, seed=k, segment_id=f"road-{k}") for k in range(6)]
-    return fill(tmp_path_factory.mktemp("data") / "store", found).path
+roads = stored(lambda: [straight_road(2, steps=8, seed=k, segment_id=f"road-{k}") for k in range(6)])
 
 
 @pytest.fixture

@@ -18,10 +18,11 @@ from helpers_saved import played
 from helpers_segments import crossing, make_segment, straight_road
 from helpers_store import fill
 from symphony.bench.criticality import GENTLE, HARD, LONGEST, criticality, hardest
-from symphony.bench.published import PDM, comfortable, derivative
+from symphony.bench.published import PDM, comfortable, derivative, pdm
 from symphony.cli import main
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
+from symphony.evaluation.report import Report, add_segment
 from symphony.files import finite
 from symphony.saved.folder import About, save_rollouts
 
@@ -59,6 +60,17 @@ def test_the_score_weighs_its_terms_as_published() -> None:
     scores |= {(1, 1, 0, 1, 1): 7, (1, 1, 1, 0, 1): 10, (1, 1, 1, 1, 0.5): 9.5}
     for terms, score in scores.items():
         assert PDM(*terms).score == pytest.approx(100 * score / 12)
+
+
+def test_where_the_log_hardly_moves_there_is_no_progress_to_make() -> None:
+    ego = lambda t: (10 * t, 0.0, 0.0, 10.0)  # noqa: E731
+    saved, found = played(two(ego, lambda t: (0.0, 500.0, 0.0, 0.0))), Report("made", "ego")
+    add_segment(found, saved)
+    for ratio in (-0.1, 0.0, 0.003, 0.4):
+        for metres, progress in ((3.2, 1.0), (30.0, max(ratio, 0.0))):
+            terms = pdm(found.rows[0] | {"progress_ratio": ratio, "log_progress": metres}, saved, [])
+            assert terms is not None
+            assert terms.progress == progress
 
 
 def two(ego: Any, other: Any, *, dt: float = 0.2, steps: int = 21) -> RunSegment:
@@ -117,6 +129,8 @@ def test_the_hardest_come_first_and_are_listed(tmp_path: Path, capsys: Any) -> N
     assert capsys.readouterr().out.split() == [one.segment for _, one in found]
     assert main(["data", "hardest", str(tmp_path / "store"), "--json", "-"]) == 0
     assert "time_to_collision" in capsys.readouterr().out
+    assert main(["data", "hardest", str(tmp_path / "store"), "--ids", "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)
 
 
 def test_of_rollouts_the_hardest_are_named_by_segment_and_number(tmp_path: Path, capsys: Any) -> None:

@@ -15,7 +15,7 @@ from torchrl.envs.utils import step_mdp
 
 from helpers_agents import make_agent
 from helpers_segments import LANE_WIDTH, crossing, hide, make_road, make_segment
-from helpers_store import brief, fill
+from helpers_store import brief, stored
 from symphony import keys
 from symphony.agents import load_agent
 from symphony.config import EvaluateConfig
@@ -159,12 +159,8 @@ def test_one_that_finds_no_room_waits_until_there_is():
 
 
 CARS = [(60, 10, 0), (85, 10, 0), (190, 12, 1), (-6, 12, 2), (120, 0, 2)]
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory):
-    rows = [row(CARS[: 3 + k], steps=8, name=f"row-{k}") for k in range(3)]
-    return fill(tmp_path_factory.mktemp("crowd") / "store", [*rows, crossing(4, steps=8)])
+ROWS = [row(CARS[: 3 + k], steps=8, name=f"row-{k}") for k in range(3)]
+store = stored(lambda: [*ROWS, crossing(4, steps=8)], opened=True)
 
 
 def test_traffic_drawn_from_a_store_is_as_open_as_that_at_hand(store):
@@ -224,6 +220,8 @@ def test_who_is_driven_is_a_matter_of_choice():
     away = np.linalg.norm(segment.position[..., :2] - segment.position[0, :, :2], axis=-1)
     close = (segment.valid & segment.valid[0] & (away <= 70)).any(1)
     assert set(near[2:].tolist()) == set(driven[2:]) & set(np.flatnonzero(close).tolist())
+    named = replace(ALL, also=(int(segment.agent_id[5]),)).choose(segment, graph)[0]
+    assert sorted(named.tolist()) == sorted(driven)
     few, rest = Crowd(2, open_traffic=True, background=True).choose(segment, graph)
     assert few.tolist() == driven[:2]
     assert sorted([*few, *rest]) == sorted(driven)

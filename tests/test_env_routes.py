@@ -322,6 +322,15 @@ def test_a_route_that_passes_itself_is_followed_in_order(speed, aside, dt):
     assert torch.equal(seen.points[0, 0, 0], torch.from_numpy(line[first]))
 
 
+@given(st.floats(0.0, 150.0))
+def test_a_route_is_followed_however_long_the_steps_are(moved):
+    routes, place = one_route(np.stack([np.arange(0.0, 600.0, SPACING), np.zeros(200)], -1)), torch.zeros(1, 1)
+    for step in range(4):
+        here = torch.tensor([[[step * moved, 0.4]]])
+        place = routes.progress(here, place, torch.tensor([[moved if step else 0.0]]))
+        assert float(place) == pytest.approx(step * moved, abs=1e-3)
+
+
 def test_an_agent_whose_routes_cannot_be_built_has_none(monkeypatch):
     segment = crossing(4)
 

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import torch
 
-from helpers_segments import crossing, hide, straight_road
+from helpers_segments import along, crossing, hide, make_road, make_segment, straight_road
 from helpers_store import fill
 from symphony import keys
 from symphony.agents import load_agent
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.driving import DrivingEnv
-from symphony.envs.dynamics import Bicycle
+from symphony.envs.dynamics import Bicycle, displacement_inverse
 from symphony.envs.observation import ObservationConfig
 from symphony.envs.scene import scene
 from symphony.errors import ConfigError, DataError
@@ -92,6 +92,27 @@ def test_it_sees_what_a_planner_sees(store, tmp_path):
     assert len(mine) == len(told) == saved.steps
     for one, other in zip(mine, told, strict=True):
         same(dataclasses.asdict(one) | {"seed": 0}, dataclasses.asdict(other) | {"seed": 0})
+
+
+def test_the_way_of_one_that_crosses_its_own_path_goes_straight_on(tmp_path):
+    """A loop to the left of 20 m radius that crosses the street it came from."""
+    angle, street = np.linspace(-np.pi / 2, np.pi, 47), np.arange(0, 101, 2.0)
+    circle = np.stack([100 + 20 * np.cos(angle), 20 + 20 * np.sin(angle)], -1)
+    off = np.stack([np.full(110, 80.0), np.arange(20, -200, -2.0)], -1)
+    lanes = [np.stack([street, 0 * street], -1), circle, off]
+    place, heading = along(np.concatenate([lanes[0], circle[1:], off[1:]]), 60 + 0.8 * np.arange(200))
+    forward = np.stack([np.cos(heading), np.sin(heading)], -1)
+    place += 0.4 * forward[:, ::-1] * [-1, 1]
+    road = make_road(lanes, successors=[(0, 1), (1, 2)])
+    fill(tmp_path / "loop", [make_segment(road, place[None], heading[None], 4 * forward[None])])
+    env = gymnasium.make(NAME, data=tmp_path / "loop", action="continuous", ends_on=()).unwrapped
+    env.reset(options={"segment": 0})
+    for there in np.concatenate([place, heading[:, None], np.full((200, 1), 4.0)], -1)[1:-1]:
+        now = env._now.get(keys.STATE)[:1]
+        env.step(displacement_inverse(now, torch.tensor(there[None], dtype=torch.float32))[0].numpy() / 8.0)
+        seen = env.seen()
+        way = seen.route[1] - seen.route[0]
+        assert np.cos(np.arctan2(*way[::-1]) - seen.ego.heading) > 0.8
 
 
 def same(one, other):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import pickle
 from dataclasses import replace
 from itertools import pairwise
@@ -30,7 +31,7 @@ from symphony.geometry import boxes_overlap
 from symphony.roadgraph import LaneGraph
 from symphony.rollouts.crowd import crowd_dataset
 from symphony.rollouts.driving import simulation
-from symphony.rollouts.lights import AMBER, GREEN, USUAL, continued, cycle
+from symphony.rollouts.lights import AMBER, GREEN, USUAL, _planned, continued, cycle
 from symphony.rollouts.onward import PRIOR, Onward, entrances, entry_rates
 from symphony.saved.folder import load_rollouts
 from symphony.saved.rollouts import world_of
@@ -81,6 +82,16 @@ def test_other_lights_take_turns_and_never_meet(logged, timing, arrow):
     # An arrow stays one, as does what is not known or flashes.
     assert (past[arrow] < SignalState.STOP).all() == (state[arrow] < SignalState.STOP).any()
     assert arrow >= 0 or (past[:2] == state[:2, :1]).all()
+
+
+@given(st.lists(st.floats(-math.pi, math.pi), min_size=2, max_size=8))
+def test_streams_that_cross_have_no_phase_together(directions):
+    axis, state = np.array(directions), np.full((len(directions), 20), SignalState.STOP, np.uint8)
+    goes = np.isin(_planned(state, axis, 2000, DT, USUAL), (*GREEN, *AMBER))
+    turn = np.abs(axis[:, None] - axis) % math.pi
+    together = (goes[:, None] & goes).any(-1)
+    assert (np.minimum(turn, math.pi - turn)[together] <= math.pi / 3 + 1e-6).all()
+    assert goes.any(-1).all()
 
 
 def extended(segment, steps, **how):
@@ -260,3 +271,5 @@ def test_rollouts_past_the_log_are_kept_and_judged_apart(tmp_path, capsys):
     for closed in (EvaluateConfig(duration=9, interactive="all"), SimulateConfig(duration=9)):
         with pytest.raises(DataError, match="4 s, 9 are asked for"):
             crowd_dataset(store, DRIVER, closed).scenes([0])
+    with pytest.raises(ConfigError, match="--inflow needs"):
+        crowd_dataset(store, DRIVER, SimulateConfig(duration=9, open_traffic=True, inflow=1.0))

@@ -18,14 +18,21 @@ import shapely
 
 from helpers_agents import small
 from helpers_segments import crossing, hide, make_road, make_segment, straight_road
-from helpers_store import fill
+from helpers_store import fill, stored
 from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.planners import paired_difference, planner_record, planners_text, run_score, winners
+from symphony.evaluation.planners import (
+    check_crowds,
+    paired_difference,
+    planner_record,
+    planners_text,
+    run_score,
+    winners,
+)  # fmt: skip
 from symphony.learning.demonstrations import SceneDataset
 from symphony.planners.interface import Control, Pose, Scenario, Traffic, checked_plan, scenario_of
 from symphony.planners.view import FunctionPlanner, Observation, lanes_of
@@ -83,11 +90,7 @@ class Together:
         return np.tile([-1.0, 0.0], (len(planners), 1))
 
 
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("planners") / "store"
-    fill(path, [crossing(4, steps=11), straight_road(4, steps=11)])
-    return path
+store = stored(lambda: [crossing(4, steps=11), straight_road(4, steps=11)])
 
 
 def run(store: Path, out: Path, planner: Any, agent: str = "", **settings: Any) -> RolloutFolder:
@@ -284,6 +287,18 @@ def test_the_command_compares_planners_among_crowds(store, tmp_path, capsys):
     assert [(one["planner"], len(one["per_run"])) for one in records] == [("idm", 4), ("log", 4)]
     assert main(["planners", *places]) == 0
     table = capsys.readouterr().out.splitlines()
+    # What a suite does not save is as usual; beside the log, who enters and which lights counts, too.
+    saved = {
+        name: value for name, value in records[0]["settings"].items() if name not in ("lights", "after_collision")
+    }
+    check_crowds([records[0] | {"settings": saved}, records[1]])
+    for more in ({"inflow": 1.0}, {"lights": [5.0, 1.0, 1.0]}, {"drives": {"3": "idm"}}):
+        beside = [one | {"crowd": "playback"} for one in records]
+        beside[1]["settings"] = beside[1]["settings"] | more
+        with pytest.raises(ConfigError, match=next(iter(more))):
+            check_crowds(beside)
+    assert main(["simulate", "playback", "--others", "idm", *words, "--out", str(tmp_path / "alone")]) == 1
+    capsys.readouterr()
     assert re.match(r"\| crowd +\| +planner \| +score \|", table[0])
     assert sorted(line.split("|")[2].strip() for line in table[2:4]) == ["idm", "log"]
     assert table[-1] == winners(records)[0]
@@ -305,9 +320,7 @@ def test_a_segment_that_failed_is_no_recording_of_its_own(tmp_path: Path) -> Non
 
 
 def test_runs_without_defined_progress_have_no_score(tmp_path: Path) -> None:
-    """Beside all lanes the ego has no route, beyond a lane that ends inside the map nothing measures its progress,
-    and a log that stands makes none.
-    """
+    """Beside all lanes, beyond a lane that ends inside the map, and beside a log that stands."""
 
     def driven(name: str, y: float, speed: float, end: int = 400) -> RunSegment:
         lanes = (end, 0), (400, 60), (400, -60)

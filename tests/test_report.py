@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers_saved import played, searched
-from helpers_segments import LANE_WIDTH, crossing, make_road, make_segment, straight_road, turned
+from helpers_segments import LANE_WIDTH, crossing, crossing_road, make_road, make_segment, straight_road, turned
 from helpers_store import fill
 from helpers_table import make_entry, make_record, make_run
 from symphony.cli import main
@@ -147,6 +147,36 @@ def test_a_red_light_is_run_where_the_front_crosses_the_stop_point() -> None:
         assert red(state) == []
     # Those of left and right, from the same stop point, are not this car's.
     assert red(SignalState.GO, SignalState.STOP) == []
+
+
+@given(st.floats(2, 20), st.floats(0, 1), st.sampled_from([0.1, 0.2, 1.0]), st.floats(-0.5, 0.5), st.floats(0, 1))
+@settings(max_examples=25)
+def test_only_the_light_of_the_own_lane_counts(speed, phase, dt, aside, ahead) -> None:
+    """Straight on beside a turning lane, whose stop point lies a little farther on."""
+    road, step = crossing_road(200.0), speed * dt
+    y = -30 - step + step * (np.arange(int(60 / step) + 4) + phase)
+    position, heading = np.stack([np.full(len(y), 1.75 + aside), y], -1)[None], np.full((1, len(y)), np.pi / 2)
+    points = np.stack([road.lanes[8][0], road.lanes[10][0] + [0, ahead, 0]]).astype(np.float32)
+    how = {"signal_lane": np.array([8, 10], np.int32), "signal_point": points}
+    for states, runs in (((SignalState.GO, SignalState.STOP), 0), ((SignalState.STOP, SignalState.GO), 1)):
+        how["signal_state"] = np.repeat(np.array(states, np.uint8)[:, None], len(y), 1)
+        segment = make_segment(road, position, heading, np.tile([0.0, speed], (1, len(y), 1)), dt, **how)
+        found = red_lights(world_of(played(segment), 0), np.array([0]), Lanes(segment), 0)
+        assert found.light.tolist() == [0] * runs
+
+
+def test_where_a_map_has_no_edge_or_light_nothing_is_said_of_them() -> None:
+    edged = straight_road(2, steps=11)
+    bare = edged.replace(segment_id="bare", road=dataclasses.replace(edged.road, boundary=Polylines.of([])))
+    found = Report("made", "interactive")
+    for one in (edged, bare):
+        add_segment(found, played(one))
+    part = found.parts[0]
+    assert (part["edged"], part["lit"], part["seconds"]) == pytest.approx((2.0, 0.0, 4.0))
+    found.parts[1].update(part | {"edged": 0.0, "collisions": 3})
+    past = found.past_log()["past_log"]
+    assert (past["offroad_time"], past["red_lights"], past["red_lights_per_minute"]) == (None, None, None)
+    assert (past["collisions"], past["collisions_per_minute"]) == (3, 45.0)
 
 
 def test_failed_runs_and_groups_are_told_apart(tmp_path: Path) -> None:

@@ -304,6 +304,7 @@ def test_whole_logs_count_by_how_long_they_are(tmp_path: Path) -> None:
     found = {name: collect([tmp_path], name)[0] for name in ("main", "long", "many")}
     names = {name: [entry.folder.name for entry in entries] for name, entries in found.items()}
     assert names == {"main": ["town", "waymo"], "long": ["long"], "many": []}
+    assert "only evaluated in other ways" in collect([tmp_path], "long")[1]
     assert "rollouts last 9 or 10 s" in compare(found["main"], "main")["notes"]
     assert "rollouts last" not in table_text(compare(found["long"], "long"))
 

@@ -49,10 +49,10 @@ def junit(result: Result) -> str:
 
 def sentence(one: Verdict) -> str:
     """Describe a verdict in words."""
-    if one.found.mean is None or one.bound is None:
-        return f"{one.threshold}: not defined in {one.found.runs} runs of {one.found.groups} groups"
-    bound = ""
-    if one.threshold.confidence is not None:
+    if one.found.mean is None:
+        return f"{one.threshold}: not defined in any run"
+    bound = ", without a bound" if one.bound is None else ""
+    if one.bound is not None and one.threshold.confidence is not None:
         bound = f", {one.threshold.side.replace('_', ' ')} {one.bound:.3g}"
         bound += f" with {100 * one.threshold.confidence:g} % confidence"
     return f"{one.threshold}: {one.found.mean:.3g}{bound}, from {one.found.runs} runs of {one.found.groups} groups"

@@ -1,9 +1,10 @@
 """The PDM score of NAVSIM, from its published definition; no code of others.
 
 Source: Dauner et al., "NAVSIM: Data-driven non-reactive autonomous vehicle simulation and benchmarking", NeurIPS
-2024, section 3.2 and its supplement; limits of comfort as in nuPlan (Karnchanachari et al., ICRA 2024). Three things
+2024, section 3.2 and its supplement; limits of comfort as in nuPlan (Karnchanachari et al., ICRA 2024). Four things
 differ: progress is relative to the log's, not to that of the planner PDM-Closed; whether the planner is at fault
-is decided by the rules of ``docs/metrics.md``; derivatives are fitted over 1.5 s of whatever step a segment has.
+is decided by the rules of ``docs/metrics.md``; its centre must stay on the road, not its corners; derivatives are
+fitted over 1.5 s of whatever step a segment has.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ _OBJECT_HIT = 0.5
 
 
 class PDM(NamedTuple):
-    """Terms of the score, each from 0 to 1: no collision at fault (half for one with an object), the box within the
-    drivable area, enough time to collision at every step, all limits of comfort kept, progress relative to the log's.
+    """Terms of the score, each from 0 to 1: no collision at fault (half for one with an object), the centre within
+    the drivable area, enough time to collision at every step, all limits of comfort kept, progress to the log's.
     """
 
     no_collision: float
@@ -67,7 +68,7 @@ def pdm(run: Mapping[str, Any], saved: SavedRollouts, collisions: list[int]) -> 
     if ratio is None and (run["beyond_route"] or run["no_route"] or not run["logged_steps"]):
         return None
     # Where the log makes no progress there is none to make.
-    stands = ratio is None or (ratio > 0 and abs(run["progress"] / ratio) < STANDS)
+    stands = ratio is None or run["log_progress"] < STANDS
     users = (AgentType.VEHICLE, AgentType.PEDESTRIAN, AgentType.CYCLIST)
     hits = [1.0 if segment.agent_type[row] in users else _OBJECT_HIT for row in collisions]
     ego = int(np.flatnonzero(saved.agents == segment.ego)[0])

@@ -195,6 +195,7 @@ def _drive(suite: Suite, pair: Pair, progress: Progress) -> None:
         found = report(folder, "ego")
         pair.report.rows += with_pdm(found, folder)
         pair.report.events |= found.events
+        pair.report.collision_in |= found.collision_in
         # The rest need not be simulated where some threshold can't be kept any more.
         if pair.planner.name != suite.baseline and any(_beyond(one, pair) for one in _thresholds(suite, pair)):
             break

@@ -105,14 +105,14 @@ def objects_at(
     size = scenes.box_size.index_select(0, scene)
     valid = valid & (step <= scenes.last_step.index_select(0, scene))[:, None]
     height = None
+    # Absent ones are written to a column past the last one, which is cut off again.
+    column = torch.where(index_valid, index, agents)
     if scenes.agent_height.shape[1]:
         own = _height(scenes, scene, state.detach()[..., :2], index)
         height = scenes.agent_height.flatten(0, 1).index_select(0, row)
-        height = height.scatter(1, index[..., None].expand(*index.shape, 2), own)
+        height = pad(height, (0, 0, 0, 1)).scatter(1, column[..., None].expand(*index.shape, 2), own)[:, :agents]
     x, y, heading, speed = state.unbind(-1)
     simulated = torch.stack([x, y, heading, speed * heading.cos(), speed * heading.sin()], -1)
-    # Absent ones are written to a column past the last one, which is cut off again.
-    column = torch.where(index_valid, index, agents)
     wide = column[..., None].expand(*index.shape, 5)
     logged = pad(logged, (0, 0, 0, 1)).scatter(1, wide, simulated)[:, :agents]
     valid = pad(valid, (0, 1)).scatter(1, column, True)[:, :agents]

@@ -278,16 +278,18 @@ class FollowedRoutes(NamedTuple):
         """Return metres along the routes of the places nearest to agents, sought around where they were before
         (``about``, in metres along), given the metres that they have ``moved`` since.
         """
-        reach, about = _CUT * moved[..., None] + _SLACK, about[..., None]
-        start = ((about / SPACING).long() - _BACK).clamp_min(0)
-        place = start + torch.arange(_SEARCHED, device=start.device)
+        moved, about = moved[..., None], about[..., None]
+        reach = _CUT * moved + _SLACK
+        # Of a step beyond 30 m the last part is searched; what is not finite leads nowhere.
+        onward = about + (moved - 30.0).clamp_min(0.0)
+        place = ((onward / SPACING).long() - _BACK).clamp(0, 1 << 40) + torch.arange(_SEARCHED, device=about.device)
         x, y = self.points(place).unbind(-1)
         way_x, way_y = x.diff(dim=-1), y.diff(dim=-1)
         length = (way_x.square() + way_y.square()).sqrt()
         away_x, away_y = position[..., :1] - x[..., :-1], position[..., 1:] - y[..., :-1]
-        along = (away_x * way_x + away_y * way_y) / length.clamp_min(1e-6)
-        along = along.clamp_min(0.0).minimum(length)
-        share = along / length.clamp_min(1e-6)
+        some = length.clamp_min(1e-6)
+        along = ((away_x * way_x + away_y * way_y) / some).clamp_min(0.0).minimum(length)
+        share = along / some
         squared = (away_x - share * way_x).square() + (away_y - share * way_y).square()
         arc = SPACING * place[..., :-1].to(about.dtype)
         near = (arc <= about + reach) & (arc + SPACING >= about - reach)

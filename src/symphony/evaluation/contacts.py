@@ -160,7 +160,9 @@ def at_fault(world: World, found: Contacts, lanes: Lanes, offroad: Bools, lights
     cut_in = np.zeros(len(kind), bool)
     cut_in[driving] = _cut_in(world, rear[driving], front[driving], found.step[driving], segment.dt)
     across = np.isin(kind, [CollisionKind.CROSSING, CollisionKind.ONCOMING])
-    red, their_red = (across & _ran_red(party.row, found.step, lights, segment.dt) for party in (me, it))
+    since = found.step[:, None] - lights.step
+    recent = (since >= 0) & (since <= RED_SECONDS / segment.dt)
+    red, their_red = (across & ((lights.agent == party.row[:, None]) & recent).any(-1) for party in (me, it))
     reaching = _reaching(me, it, lanes) | offroad[me.row, found.step]
     backing = (me.speed < -STILL) & (face == _REAR)
     beside = np.isin(kind, [CollisionKind.ONCOMING, CollisionKind.SIDESWIPE])
@@ -214,11 +216,6 @@ def _face(me: _Party, it: _Party) -> Indices:
     rearmost = places[0] - (reach[0].numpy() - 0.5 * me.size[:, 0])
     side = np.where(rearmost > 0.5 * me.size[:, 0] - CORNER, _FRONT, _SIDE)
     return np.where(which == 0, end, np.where(which == 1, side, corner))
-
-
-def _ran_red(row: Indices, step: Indices, lights: Lights, dt: float) -> Bools:
-    since = step[:, None] - lights.step
-    return ((lights.agent == row[:, None]) & (since >= 0) & (since <= RED_SECONDS / dt)).any(-1)
 
 
 def _reaching(me: _Party, it: _Party, lanes: Lanes) -> Bools:

@@ -98,8 +98,8 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
 
     An agent runs a light if its front crosses the stop point in the direction of the lane, within the lane's width
     and on its level, while the light is red (a plain or arrow stop, not a flashing one), and it follows that lane: of
-    the lanes whose lights it crosses at once the one that its path is nearest to, before the stop point where that
-    lies at the end of the lane, behind it elsewhere. ``start`` is the step of the log at which the first state lies.
+    the lanes whose stop points it crosses side by side the one that its path is nearest to, before the stop point
+    where that lies at the end of the lane, behind it elsewhere. ``start`` is the step of the log at the first state.
     """
     segment, graph = lanes.segment, lanes.graph
     known = np.flatnonzero(graph.length[segment.signal_lane] > 0)
@@ -118,7 +118,7 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
     away = front[:, :, None] - stop
     along = (away * direction).sum(-1)
     across = away[..., 1] * direction[:, 0] - away[..., 0] * direction[:, 1]
-    passing = (along[:, :-1] < 0) & (along[:, 1:] >= 0) & (along[:, 1:] < 15)
+    passing = (along[:, :-1] < 0) & (along[:, 1:] >= 0)
     passing &= np.abs(across[:, 1:]) <= 0.5 * lanes.width[lane]
     passing &= (forward[:, 1:, None] * direction).sum(-1) > math.cos(SAME_WAY)
     passing &= (world.valid[evaluated, 1:] & world.valid[evaluated, :-1])[..., None]
@@ -129,7 +129,9 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
     # There are few crossings.
     for m, t in zip(*(part.tolist() for part in passing.any(-1).nonzero()), strict=True):
         best, least = -1, _FOLLOWED
-        for light in passing[m, t].nonzero()[0]:
+        # Lanes that part here differ in direction, so that one front may cross their stop points in different steps.
+        beside = np.linalg.norm(stop - stop[passing[m, t].argmax()], axis=-1) < _PASSED
+        for light in (passing[m].any(0) & beside).nonzero()[0]:
             at_end = along_lane[light] > 0.5 * length[light]
             part = slice(0, t + 1) if at_end else slice(t + 1, None)
             points = world.position[evaluated[m], part][world.valid[evaluated[m], part]]
@@ -138,7 +140,11 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
                 distance = float(shapely.distance(lines[light], shapely.points(points)).mean())
                 best, least = (int(light), distance) if distance < least else (best, least)
         # One that changes just then is not held against the agent.
-        if best >= 0 and np.isin(segment.signal_state[known[best], start + t : start + t + 2], RED).all():
+        if (
+            best >= 0
+            and passing[m, t, best]
+            and np.isin(segment.signal_state[known[best], start + t : start + t + 2], RED).all()
+        ):
             found.append((int(evaluated[m]), t + 1, int(known[best])))
     return Lights(*np.array(found, np.int64).reshape(-1, 3).T)
 

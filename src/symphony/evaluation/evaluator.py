@@ -60,8 +60,8 @@ class Evaluation:
         own: dict[str, float] = {}
         for path, values in self.own.items():
             own[path], own[f"{path}_se"] = self.metrics.mean(values)
-        how = {"interactive": self.interactive, "search": self.search, "seed": self.config.seed}
-        how["trees"] = self.config.trees if self.search == "tree" else 0
+        trees = self.config.trees if self.search == "tree" else 0
+        how = {"interactive": self.interactive, "search": self.search, "seed": self.config.seed, "trees": trees}
         return {"agent": self.agent, **self.metrics.compute(), **own, **how}
 
 

@@ -42,7 +42,6 @@ def measure(
     Raises a :class:`DataError` where no segment has enough interactive agents.
     """
     sums = defaultdict[str, list[Any]](list)
-
     graph_of = lru_cache(maxsize=16)(lambda number: LaneGraph(store.road(number)))
     for begin in range(0, len(store), _CHUNK):
         # Agents of segments of equal length are fitted together: many small fits take far longer.
@@ -60,8 +59,7 @@ def measure(
             sums["fit_error"].append(_fit_error(group))
         if progress is not None:
             progress(min(begin + _CHUNK, len(store)), len(store))
-    count = len(sums["collided"])
-    if not count:
+    if not (count := len(sums["collided"])):
         raise DataError(f"no segment has {interactive} interactive agents", file=store.path)
     found = {name: np.concatenate(values) for name, values in sums.items()}
     turn = found["branches"]
@@ -123,8 +121,7 @@ def _spread(values: NDArray[Any]) -> dict[str, float]:
 
 def shortfalls(quality: dict[str, Any]) -> list[str]:
     """Return the targets that a set misses, in words; empty for a good one."""
-    rates = {name: quality[name] for name in ("collision_rate", "offroad_time")}
-    over = [f"{n} {rate:.2f} % is over {MOST_FAULTS} %" for n, rate in rates.items() if rate > MOST_FAULTS]
+    rates = ((name, quality[name]) for name in ("collision_rate", "offroad_time"))
+    over = [f"{name} {rate:.2f} % is over {MOST_FAULTS} %" for name, rate in rates if rate > MOST_FAULTS]
     few = {name: share for name, share in quality["directions"].items() if share < LEAST_DIRECTION}
-    end = f"below {LEAST_DIRECTION:.0f} %"
-    return over + [f"only {n:.1f} % of the choices are {k}, {end}" for k, n in few.items()]
+    return over + [f"only {n:.1f} % of the choices are {k}, below {LEAST_DIRECTION:.0f} %" for k, n in few.items()]

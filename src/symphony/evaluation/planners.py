@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,8 @@ _ABOUT = ("segment", "rollout", "group", "failed", "progress_ratio", "beyond_rou
 _RUN = (*_ABOUT, "collision", "at_fault_collision", "red_lights", "offroad_time")  # of each run, in a record
 _FREE = ("planner", "planner_seconds", "rollouts")
 """Settings of the planner itself, and of how often it is tried."""
-_BESIDE_LOG = ("interactive", "others", "open_traffic", "radius", "duration", "seed")
+_LATER: dict[str, Any] = {"lights": [], "after_collision": "go-on"}
+_BESIDE_LOG = ("interactive", "others", "open_traffic", "radius", "duration", "seed", "inflow", *_LATER, "drives")
 """Settings that mean something where all others play back their log."""
 
 Record = dict[str, Any]
@@ -62,10 +64,6 @@ def planner_record(folder: RolloutFolder) -> Record:
     if "ego" not in about.drivers:
         raise DataError("no planner drove here: simulate with --planner", file=folder.path, field="drivers")
     rows = report(folder, "ego").rows
-    for row in rows:
-        # Metres of a planner without a route are no progress: it may have gone anywhere.
-        lost = bool(row["no_route"]) and row["progress_ratio"] is not None
-        row |= {"no_route": int(lost), "progress_ratio": None if lost else row["progress_ratio"]}
     member = np.unique([row["group"] for row in rows], return_inverse=True)[1]
     scores = np.array([run_score(row) for row in rows], np.float64)
     known = ~np.isnan(scores)
@@ -126,7 +124,7 @@ def check_crowds(records: Sequence[Record]) -> None:
     first: dict[str, Record] = {}
     for one in records:
         other = first.setdefault(crowd_name(one), one)
-        here, there = one["settings"], other["settings"]
+        here, there = (_LATER | record["settings"] for record in (one, other))  # suites do not save them
         beside_log = one["crowd"] == other["crowd"] == PLAYBACK
         names = _BESIDE_LOG if beside_log else [name for name in there | here if name not in _FREE]
         differing = [name for name in names if here.get(name) != there.get(name)]
@@ -142,10 +140,9 @@ def check_crowds(records: Sequence[Record]) -> None:
 
 def _scores(record: Record) -> dict[str, float | None]:
     """Return the mean score of each segment, None where no run has one."""
-    scores: dict[str, list[float]] = {run["segment"]: [] for run in record["per_run"]}
+    scores = defaultdict[str, list[float]](list)
     for run in record["per_run"]:
-        if (score := run_score(run)) is not None:
-            scores[run["segment"]].append(score)
+        scores[run["segment"]] += [] if (score := run_score(run)) is None else [score]
     return {segment: float(np.mean(each)) if each else None for segment, each in scores.items()}
 
 

@@ -66,7 +66,8 @@ class Report:
     collisions: Counter[tuple[str, str, bool, bool]] = field(default_factory=Counter)
     events: dict[str, list[Event]] = field(default_factory=dict)  # of each segment, marked in its replay
     collision_in: dict[str, Array] = field(default_factory=dict)  # of each segment, seconds [K, T, N]
-    # Sums over runs that did not fail, in the log and past its end: seconds of agents, and what happened in them.
+    # Sums over runs that did not fail, in the log and past its end: seconds of agents (on
+    # maps with edges, with lights), and what happened in them.
     parts: tuple[dict[str, float], ...] = field(default_factory=lambda: tuple(map(defaultdict, [float, float])))
 
     def replay(self, saved: SavedRollouts) -> Replay:
@@ -80,10 +81,12 @@ class Report:
             return {}
         found = {}
         for name, part in zip(("log", "past_log"), self.parts, strict=True):
-            minutes, share = part["seconds"] / 60, _percent(np.array(part["offroad"]), part["seconds"])
-            numbers = {"agent_minutes": minutes, "offroad_time": share}
-            for kind in ("collisions", "red_lights"):
-                numbers |= {kind: int(part[kind]), f"{kind}_per_minute": part[kind] / minutes if minutes else None}
+            share = _percent(np.array(part["offroad"]), part["edged"])
+            numbers = {"agent_minutes": part["seconds"] / 60, "offroad_time": share}
+            for kind, where in (("collisions", "seconds"), ("red_lights", "lit")):
+                minutes = part[where] / 60
+                numbers[kind] = int(part[kind]) if minutes else None
+                numbers[f"{kind}_per_minute"] = part[kind] / minutes if minutes else None
             found[name] = numbers
         return found
 
@@ -130,6 +133,10 @@ def report(
     for number, saved in enumerate(folder):
         add_segment(found, saved)
         progress_bar(number + 1, len(folder))
+    for row in found.rows if evaluated == "ego" else ():
+        # Metres of a planner without a route are no progress: it may have gone anywhere.
+        none = bool(row["no_route"]) and row["progress_ratio"] is not None
+        row |= {"no_route": int(none), "progress_ratio": None if none else row["progress_ratio"]}
     for lost in folder.failures:
         about = {"segment": lost.segment, "group": lost.group or lost.segment, "failed": lost.failed}
         found.rows += [dict.fromkeys(NUMBERS) | about | {"rollout": k} for k in range(lost.rollouts)]
@@ -182,6 +189,7 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
             "min_ttc": _most(-ttc, -1.0),
             "low_ttc_time": _percent(ttc < LOW_TTC, steps),
             "progress": float(driven[k][known].mean()) if known.any() else None,
+            "log_progress": whole,
             "progress_ratio": float(compared[k][known].sum()) / whole if whole > 1 else None,
             "beyond_route": int((~known).sum()),
             "no_route": int((saved.goal[k, who] < 0).sum()),
@@ -199,7 +207,10 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
         if k not in saved.failed:
             for part, within in zip(found.parts, (slice(1, end + 1), slice(end + 1, None)), strict=True):
                 begin, stop, _ = within.indices(world.valid.shape[1])
-                part["seconds"] += segment.dt * int(counted[:, begin - 1 : max(stop - 1, 0)].sum())
+                seconds = segment.dt * int(counted[:, begin - 1 : max(stop - 1, 0)].sum())
+                part["seconds"] += seconds
+                part["edged"] += seconds * (len(segment.road.boundary) > 0)
+                part["lit"] += seconds * (len(segment.signal_lane) > 0)
                 part["offroad"] += segment.dt * int(off[rows, within].sum())
                 for kind, step in (("collisions", hits.step), ("red_lights", lights.step)):
                     part[kind] += int(((step >= begin) & (step < stop)).sum())

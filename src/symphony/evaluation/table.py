@@ -106,8 +106,8 @@ def collect(
         else:
             wanted = {(interactive, duration) for duration in (0, lasting or WHOLE_LOG)}
             how = {n: (one["config"]["interactive"], one["config"]["duration"]) for n, one in kept.items()}
-            kept = {n: one for n, one in kept.items() if how[n] in wanted and setting_seconds(one) == seconds}
-            names = records.fitting(kept, patterns)
+            fits = [n for n, one in kept.items() if how[n] in wanted and setting_seconds(one) == seconds]
+            names = records.fitting(fits, patterns)
             reason = "only evaluated in other ways" if kept else "not evaluated by symphony evaluate"
         if not names:
             left_out.setdefault(reason, []).append(folder)
@@ -206,10 +206,7 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
     for entry in entries:
         found.setdefault((entry.method, entry.way), []).append(entry)
     methods = [method for method, _ in found]
-    paper = {
-        method: {key: {"mean": mean, "se": error} for key, (mean, error) in cells.items()}
-        for method, cells in figures.items()
-    }
+    paper = {m: {key: {"mean": a, "se": b} for key, (a, b) in cells.items()} for m, cells in figures.items()}
     _mark_best([{"method": method} | cells for method, cells in paper.items()])
     rows: list[dict[str, Any]] = []
     for (method, way), mine in found.items():
@@ -220,9 +217,8 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
             row[key] = _cell([one.number(key) for one in mine] or [first.baseline(method, key)])
         rows.append(row | {"paper": paper.get(method, {})})
     _mark_best(rows)
-    interactive, seconds = SETTINGS[setting]
-    about = {"setting": setting, "interactive": interactive, "duration": seconds, "paper": dataset}
-    return about | {"columns": keys, "rows": rows, "notes": _notes(entries, dataset)}
+    about = {"setting": setting, "paper": dataset, "columns": keys, "rows": rows, "notes": _notes(entries, dataset)}
+    return about | dict(zip(("interactive", "duration"), SETTINGS[setting], strict=True))
 
 
 def _cell(values: Sequence[float]) -> dict[str, Any]:
@@ -279,11 +275,9 @@ def _leaves(config: Mapping[str, Any]) -> dict[str, Any]:
 def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
     """Return what else must be known to read a table."""
     record = entries[0].record
-    notes = [
-        f"{record['segments']} run segments in {record['data']['name']} ({record['data']['checksum'][:12]}); "
-        "± standard error over seeds; bold: best of the BC methods and of the MGAIL methods; collisions are counted "
-        "at states only, as the paper counts them"
-    ]
+    where = f"{record['segments']} run segments in {record['data']['name']} ({record['data']['checksum'][:12]})"
+    notes = [where, "± standard error over seeds", "bold: best of the BC methods and of the MGAIL methods"]
+    notes.append("collisions are counted at states only, as the paper counts them")
     horizons = sorted({round(entry.record["horizon"], 1) for entry in entries if "horizon" in entry.record})
     if any(each != setting_seconds(record) for each in horizons):
         notes.append(f"rollouts last {' or '.join(f'{each:g}' for each in horizons)} s")

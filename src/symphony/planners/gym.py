@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import gymnasium
 import numpy as np
-import shapely
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from symphony.data.store import SegmentStore
 from symphony.envs.driving import DrivingEnv, Event
 from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
-from symphony.envs.scene import scene
+from symphony.envs.scene import SceneBatch, scene
 from symphony.errors import ConfigError, DataError
 from symphony.planners.driver import route_from
 from symphony.planners.interface import HISTORY, Moment, Reals, Scenario, scenario_of, traffic_of
@@ -62,6 +61,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
     env: DrivingEnv
     _now: TensorDictBase
     _before: list[TensorDictBase]
+    _scene: SceneBatch
     _told: tuple[Scenario, tuple[Lane, ...], tuple[Reals, ...]] | None
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own
 
@@ -147,15 +147,13 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         """Return what a planner that is a function would observe now; its seed is 0."""
         ego, state = self.segment.ego, self._now.get(keys.STATE)[0].double().numpy()
         if self._told is None:
-            graph, route = LaneGraph(self.segment.road), np.zeros((0, 2), np.float32)
-            made = scene(self.segment, [ego], graph)
-            if (which := int(made.route_logged[0, 0])) >= 0:
-                route = made.whole_route(0, 0, which).numpy()
+            which = int(self._scene.route_logged[0, 0])
+            route = self._scene.whole_route(0, 0, which).numpy() if which >= 0 else np.zeros((0, 2), np.float32)
             first = self._before[0] if self._before else self._now
             told = scenario_of(self.segment, ego, route, first.get(keys.STATE)[0].numpy(), 0)
             self._told = told, lanes_of(told), crosswalks_of(told)
         told, lanes, crosswalks = self._told
-        far = shapely.LineString(told.route).project(shapely.Point(state[:2])) if len(told.route) else 0.0
+        far = float(self._now.get(keys.PROGRESS)[0])
         now, past = self._moment(self._now), tuple(map(self._moment, self._before))
         at = self.segment, ego, int(self._now.get(keys.STEP)), state
         return observation_of(told, traffic_of(*at, now, past, route_from(told.route, far)), lanes, crosswalks)
@@ -176,12 +174,11 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
             steps = round(self.duration / segment.dt) + 1
             timed = ("position", "heading", "velocity", "valid", "signal_state")
             segment = segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})
-        graph = LaneGraph(segment.road) if self.observation.route else None
-        made = scene(segment, [segment.ego], graph, number=number)
+        self._scene = scene(segment, [segment.ego], LaneGraph(segment.road), number=number)
         self.segment, self.segment_id, ends = segment, segment.segment_id, self.ends_on
         self._before, self._told = [], None
-        self.env = DrivingEnv(made, self.dynamics, self.observation, reward=self.reward, ends_on=ends)
-        self._now = self.env.start(torch.tensor(0), goal=made.route_logged[0] if graph else None)
+        self.env = DrivingEnv(self._scene, self.dynamics, self.observation, reward=self.reward, ends_on=ends)
+        self._now = self.env.start(torch.tensor(0), goal=self._scene.route_logged[0])
 
     def _observed(self) -> Observed:
         """Return the ego's observation as NumPy arrays."""

@@ -23,7 +23,7 @@ from symphony.data.selection import MOVING, interactive_choice, named_vehicles, 
 from symphony.data.store import SegmentStore
 from symphony.envs.routes import route_table
 from symphony.envs.scene import SceneBatch, beyond, map_edge, scene
-from symphony.errors import DataError, DataWarning
+from symphony.errors import ConfigError, DataError, DataWarning
 from symphony.learning.demonstrations import SceneDataset
 from symphony.learning.experts import IN_LANE
 from symphony.roadgraph import LaneGraph, lane_of
@@ -77,7 +77,7 @@ class Crowd:
         vehicle, moves = (segment.agent_type == AgentType.VEHICLE) & there.any(1), travel(segment) > MOVING
         stands = vehicle & ~moves & _in_lane(segment, graph)
         first = there.argmax(1)
-        rest = np.setdiff1d(np.flatnonzero((vehicle & moves) | stands), early)
+        rest = np.setdiff1d(np.flatnonzero((vehicle & moves) | stands), [*early, *order])
         rest = rest[np.lexsort((_distance_at(segment, first)[rest], stands[rest], first[rest]))]
         if not self.open_traffic:
             rest = rest[(first[rest] == 0) & stands[rest]]
@@ -162,6 +162,8 @@ def crowd_dataset(
     in_open, onward = config.open_traffic or everyone or rule, None
     if isinstance(config, SimulateConfig):
         in_open = in_open or config.after_collision in ("remove", "respawn")
+        if config.inflow and not (everyone or rule):
+            raise ConfigError("--inflow needs --interactive all or --others: nobody drives those who enter")
         # Vehicles without a driver don't enter.
         inflow = config.inflow if rule or agent.policy is not None else 0.0
         onward = Onward(inflow, config.lights, config.seed) if config.duration and in_open else None

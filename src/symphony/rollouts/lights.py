@@ -20,7 +20,7 @@ States = NDArray[np.uint8]
 Rows = NDArray[np.intp]
 
 USUAL = (25.0, 3.0, 2.0)  # seconds of green, amber and all red of a phase
-JUNCTION = 30.0  # metres between stop points, from one to the next, within which lights are of one junction
+JUNCTION = 40.0  # metres between stop points, from one to the next, within which lights are of one junction
 GREEN = (SignalState.GO, SignalState.ARROW_GO)
 AMBER = (SignalState.CAUTION, SignalState.ARROW_CAUTION)
 ARROW = (SignalState.ARROW_STOP, SignalState.ARROW_CAUTION, SignalState.ARROW_GO)
@@ -32,10 +32,12 @@ def continued(segment: RunSegment, graph: LaneGraph, steps: int, timing: tuple[f
 
     The lights of a junction go on with their cycle where the log shows a whole one: some change of them twice, and
     equal states that far apart. Otherwise, and where a timing (seconds of green, amber and all red) is given, phases
-    take turns, each with the timing or :data:`USUAL`: first those that are green, as long as they are; then those
-    that cross them, then those along them, or those that have waited longest. Flashing and unknown lights stay so.
+    take turns, each with the timing or :data:`USUAL`: first those that are green, as long as they are; then those of
+    one direction after the other, the longest red first. Flashing and unknown lights stay so.
     """
-    state = _known(segment.signal_state)
+    state = segment.signal_state
+    latest = np.maximum.accumulate(np.where(state != SignalState.UNKNOWN, np.arange(state.shape[1]), 0), 1)
+    state = np.take_along_axis(state, latest, 1) if state.size else state
     out = np.concatenate([segment.signal_state, np.repeat(state[:, -1:], steps - state.shape[1], 1)], 1)
     logged, later = state.shape[1], steps - state.shape[1]
     for junction in _junctions(segment.signal_point[:, :2]):
@@ -60,12 +62,6 @@ def cycle(state: NDArray[Any]) -> int | None:
         if (code[span:] == code[:-span]).all():
             return int(span)
     return None
-
-
-def _known(state: NDArray[Any]) -> NDArray[Any]:
-    """Return states with those last known where they are unknown."""
-    step = np.where(state != SignalState.UNKNOWN, np.arange(state.shape[1]), 0)
-    return np.take_along_axis(state, np.maximum.accumulate(step, 1), 1) if state.size else state
 
 
 def _junctions(points: NDArray[Any]) -> list[Rows]:
@@ -97,10 +93,11 @@ def _planned(
     logged = state.shape[1]
     last = np.where((shows | ambers).any(1), logged - 1 - (shows | ambers)[:, ::-1].argmax(1), -1)
     now = shows[:, -1] if shows[:, -1].any() else ambers[:, -1]
-    main = axis[now][0] if now.any() else axis[last.argmax()]
-    turn = turn_between(axis, np.full_like(axis, main))
-    across = np.minimum(turn, math.pi - turn) > math.pi / 4
-    rest = [part for part in (np.flatnonzero(~now & across), np.flatnonzero(~now & ~across)) if len(part)]
+    rest, waiting = list[Rows](), np.logical_not(now)
+    while waiting.any():  # streams that cross each other share no phase
+        turn = turn_between(axis, np.full_like(axis, axis[waiting.argmax()]))
+        along = waiting & (np.minimum(turn, math.pi - turn) <= math.pi / 6)
+        rest, waiting = [*rest, np.flatnonzero(along)], waiting & ~along
     phases = [np.flatnonzero(now)] * bool(now.any()) + sorted(rest, key=lambda part: last[part].max())
     # One that has its junction for itself is red for the time of another phase.
     phases += [np.zeros(0, np.int64)] * (len(phases) == 1)
