@@ -12,7 +12,7 @@ import pytest
 from helpers_saved import played, searched
 from helpers_segments import crossing, hide, straight_road, turned
 from symphony.cli import main
-from symphony.data.segment import SignalState
+from symphony.data.segment import Polylines, SignalState
 from symphony.saved.folder import About, save_rollouts
 from symphony.saved.openscenario import openscenario
 from symphony.saved.rollouts import world_of
@@ -20,6 +20,9 @@ from symphony.saved.rollouts import world_of
 
 def cases():
     seen = hide(hide(crossing(4, steps=31), 2, slice(5, 9)), 3, slice(0, 30))
+    lines = {name: getattr(seen.road, name) for name in ("lanes", "boundary", "marks")}  # on a hill
+    hill = {name: Polylines(one.points + np.float32([0, 0, 12]), one.offsets) for name, one in lines.items()}
+    seen = seen.replace(road=dataclasses.replace(seen.road, **hill))
     seen = seen.replace(agent_type=np.array([1, 2, 3, 4], np.uint8), origin=np.array([5e5, -20.0, 0]))
     return [played(seen, [0, 1]), *searched()[1]]
 
@@ -90,6 +93,8 @@ def test_mcap_has_every_agent_where_it_was(tmp_path):
         assert [at for at, _ in messages["/traffic"]] == [at for at, _ in messages["/tf"]] == times
         lines = sum(len(getattr(segment.road, name)) for name in ("lanes", "boundary", "marks"))
         assert len(messages["/map"][0][1].entities[0].lines) == lines
+        # On a map without levels everything stands at 0.
+        assert {p.z for line in messages["/map"][0][1].entities[0].lines for p in line.points} == {0.0}
         for step, (_, now) in enumerate(messages["/traffic"]):
             *boxes, lights = now.entities
             rows = [segment.agent_id.tolist().index(int(box.id)) for box in boxes]

@@ -17,9 +17,9 @@ import pytest
 import torch
 from PIL import Image
 
-from helpers_runs import same_weights, tiny, weights
+from helpers_runs import run_of, same_weights, tiny, weights
 from helpers_segments import crossing, hide, straight_road
-from helpers_store import fill
+from helpers_store import stored
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import checkpoints
 from symphony.config import EvaluateConfig, PreviewConfig, TrainConfig, ValidationConfig
@@ -35,6 +35,8 @@ from symphony.training.hooks import QUANTILES, ROLLOUTS, quantiles, samples_of
 from symphony.training.logging import Tracker, read_metrics
 
 MOTIONS = ("speed", "acceleration", "turn")
+store = stored(lambda: [straight_road(4, steps=6), crossing(4, steps=5), crossing(5, seed=1, steps=6)])
+held_out = stored(lambda: [crossing(6, seed=seed, steps=5) for seed in range(10, 14)])
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -44,18 +46,6 @@ def few() -> Iterator[None]:
         patch.setattr("symphony.training.hooks.SEGMENTS", 2)
         patch.setattr("symphony.training.hooks.animate_rollouts", partial(animate_rollouts, size=2.0))
         yield
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    shown = [straight_road(4, steps=6), crossing(4, steps=5), crossing(5, seed=1, steps=6)]
-    return fill(tmp_path_factory.mktemp("data") / "train", shown).path
-
-
-@pytest.fixture(scope="module")
-def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found = [crossing(6, seed=seed, steps=5) for seed in range(10, 14)]
-    return fill(tmp_path_factory.mktemp("data") / "held_out", found).path
 
 
 def config(store: Path, out: Path, every: int, method: Any = "bc", **changes: Any) -> TrainConfig:
@@ -89,9 +79,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("symphony.training.hooks.animate_rollouts", write)
 
 
-@pytest.fixture(scope="module")
-def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(config(store, tmp_path_factory.mktemp("runs") / "bc_ts_h", 4, "bc_ts_h", steps=5))
+run = run_of(partial(config, every=4, method="bc_ts_h", steps=5))
 
 
 def test_a_run_shows_itself_now_and_then_and_at_its_end(run: Path) -> None:
@@ -99,7 +87,7 @@ def test_a_run_shows_itself_now_and_then_and_at_its_end(run: Path) -> None:
     assert list(previewed(run)) == [4, 5]
     for name in media(run):
         with Image.open(run / "media" / name) as image:
-            assert image.n_frames == 5
+            assert image.n_frames == 6
 
 
 @pytest.mark.parametrize(("method", "validated"), [("bc_ts_h", True), ("mgail", False)])

@@ -24,18 +24,19 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from PIL import Image, ImageSequence
 
+from helpers_saved import played
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
+from helpers_table import make_record, make_run
 from symphony.cli import main
-from symphony.data.segment import MarkType, Polylines, RunSegment
+from symphony.data.segment import MarkType, Polylines, RunSegment, SignalState
 from symphony.errors import ConfigError
-from symphony.evaluation import records as records_module
 from symphony.render import Clip, animate_rollouts, plot_curves, plot_grid, plot_rollout, plot_segment, viewer
 from symphony.render.curves import read_curves, smoothed
-from symphony.render.plots import colors_of
+from symphony.render.plots import colors_of, saved_clip
 from symphony.render.roads import CORNERS, NOSE, SIGNALS, lane_arrows, pieces, place, road_ribbon
 from symphony.render.style import AGENT_COLORS, INK, PLAYBACK, ROAD, new_figure, view_around
-from symphony.render.video import frames_of
+from symphony.render.video import _Panel, frames_of
 
 
 def blank() -> Axes:
@@ -282,6 +283,32 @@ def test_events_are_marked_where_they_begin() -> None:
     assert "off road" not in labels(axes)
 
 
+def test_a_clip_begins_with_the_first_state_and_marks_who_is_evaluated() -> None:
+    saved = played(straight_road(3, steps=21), [0, 1], 2, drivers=("me", "background:idm"))
+    saved.collision[0, 5:, 1] = saved.offroad[1, 3:, 1] = True
+    clip = saved_clip(saved)
+    np.testing.assert_allclose(clip.position[:, :, 0], np.stack([saved.segment.position[:2, 0, :2]] * 2), atol=1e-6)
+    assert not (clip.collision | clip.offroad).any()
+    saved.collision[0, 5:, 0] = True
+    assert np.argwhere(saved_clip(saved).collision).tolist() == [[0, 0, step] for step in range(6, 21)]
+
+
+def test_a_light_keeps_its_colour_in_a_film_and_its_entry_in_the_legend(tmp_path: Path) -> None:
+    segment = crossing(2, steps=9)
+    state = np.full_like(segment.signal_state, SignalState.GO)
+    state[:, 3] = SignalState.CAUTION
+    clip = saved_clip(played(segment.replace(signal_state=state)))
+    animate_rollouts([clip], tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as image:
+        shown = {
+            color for frame in ImageSequence.Iterator(image) for _, color in frame.convert("RGB").getcolors(1 << 20)
+        }
+    assert tuple(round(255 * part) for part in to_rgb(SIGNALS["caution"][1])) in shown
+    panel = _Panel(clip)
+    panel.settle(axes := blank())
+    assert {"light: go", "light: caution"} <= set(labels(axes))
+
+
 def test_playback_vehicles_are_drawn_where_they_were_hit() -> None:
     segment, at = straight_road(4, steps=12), 4
     clip = rollouts(segment, [0], 1, collision=np.arange(12) >= at)
@@ -304,7 +331,7 @@ def test_agents_have_their_colours_in_pictures_and_pages() -> None:
     for name, color in (("facecolor", AGENT_COLORS[0]), ("edgecolor", INK)):
         shown = [tuple(getattr(by_gid(axes, f"box-{k}"), f"get_{name}")()[0][:3]) for k in range(30)]
         assert [k for k in range(30) if shown[k] == to_rgb(color)] == [segment.ego]
-    assert len([label for label in labels(axes) if label.startswith(("ego", "interactive"))]) == 8
+    assert len([label for label in labels(axes) if label.startswith(("ego", "vehicle"))]) == 8
     assert "and 22 more in colour" in labels(axes)
 
 
@@ -419,7 +446,7 @@ def test_an_evaluation_can_be_animated(tmp_path: Path) -> None:
     file = tmp_path / "rollouts.gif"
     options = ["--data", str(tmp_path / "store"), "--figure", str(file), "--rollouts", "2"]
     assert main(["evaluate", "constant_velocity", *options]) == 0
-    assert len(durations(file)) == 6
+    assert len(durations(file)) == 7
 
 
 def records(count: int = 30, **metrics: float) -> list[dict[str, float]]:
@@ -490,15 +517,9 @@ def test_the_command_draws_them(tmp_path: Path, capsys: pytest.CaptureFixture[st
     {"policy": None}, {"log": [1, 2]}, {"log": [1.5, 2.0, 3.0]}, {"policy": [-1, 2, 3]}, {"policy": [1 << 70, 2, 3]},
 ])  # fmt: skip
 def test_a_damaged_evaluation_is_named(tmp_path: Path, damage: Any, capsys: Any) -> None:
-    record = {"format": 2, "run": {"updates": 1, "checkpoint": 1, "named": False}, "playback": {}}
-    record |= {"data": {"name": "a", "checksum": "b"}, "cost": {"simulation": 1}, "constant_velocity": {}}
-    parts = records_module._PARTS["config"]
-    record |= {"config": dict.fromkeys(parts, 0), "curvature": {"policy": [1, 2, 3], "log": [3, 2, 1]}}
-    folder = tmp_path / "run"
-    (folder / "evaluations").mkdir(parents=True)
-    (folder / "config.json").write_text('{"method": "bc"}')
-    command = ["plot", "curvature", str(folder), "--out", str(tmp_path / "a.png")]
-    for status, held in ((0, record), (1, {**record, "curvature": {**record["curvature"], **damage}})):
-        (folder / "evaluations" / "one.json").write_text(json.dumps(held))
+    counts = {"policy": [1, 2, 3], "log": [3, 2, 1]}
+    for name, status, held in (("whole", 0, counts), ("run", 1, {**counts, **damage})):
+        folder = make_run(tmp_path / name, "bc", 0, make_record() | {"curvature": held})
+        command = ["plot", "curvature", str(folder), "--out", str(tmp_path / "a.png")]
         assert main(command) == status, capsys.readouterr().err
     assert f"file {folder}, field curvature: an evaluation holds no counts" in capsys.readouterr().err

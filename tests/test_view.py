@@ -129,6 +129,14 @@ def test_the_page_holds_all_segments_and_loads_nothing(tmp_path: Path) -> None:
     assert "/*" not in re.sub(r"/\*.*?\*/", "", page, flags=re.S)
 
 
+def test_what_panes_share_of_a_log_is_all_of_it() -> None:
+    """Who is driven in one folder may play the log back in another, past its end as well."""
+    segment = straight_road(3, steps=16).replace(logged=11)
+    for agents in ([0], [1, 2]):
+        held = unpacked(packed_log(played(segment, agents)))[1]["log.valid"]
+        np.testing.assert_array_equal(held, segment.valid)
+
+
 def test_chosen_segments_pictures_and_animations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_rollouts(tmp_path / "sim", ABOUT, pages()[:2])
     sim, page = str(tmp_path / "sim"), tmp_path / "one.html"
@@ -137,7 +145,7 @@ def test_chosen_segments_pictures_and_animations(tmp_path: Path, capsys: pytest.
     for name in ("a.png", "a.gif"):
         assert main(["view", sim, "--out", str(tmp_path / name)]) == 0
         with Image.open(tmp_path / name) as image:
-            assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 20)
+            assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 21)
     wrong = {("--out", str(tmp_path / "a.doc")): ".mp4", ("--segments", "nothing"): "no rollouts of this segment"}
     for words, why in wrong.items():
         assert main(["view", sim, *words]) == 1

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 from bridges import bridges
-from made import Case, segment_of
-from scenes import cases
+from made import NORTH, OWN, Case, segment_of
+from scenes import car, cases, ego
 
 from helpers_saved import played
 from symphony.data.segment import AgentType
@@ -19,6 +19,8 @@ from symphony.envs.scene import collate, scene
 from symphony.evaluation.contacts import contacts
 from symphony.evaluation.report import KIND_NAMES, Report, add_segment
 from symphony.metrics import CollisionKind, collision_kinds
+from symphony.render.plots import draw_hit, saved_clip
+from symphony.render.style import new_figure
 from symphony.rollouts.unroll import between_states
 from symphony.saved.rollouts import SavedRollouts, world_of
 
@@ -113,3 +115,15 @@ def test_a_report_says_what_is_right(case: Case, dt: float) -> None:
 def test_there_are_enough_of_them() -> None:
     names = [case.name for case in ALL]
     assert len(names) == len(set(names)) >= 60
+
+
+def test_who_stands_on_a_bridge_is_not_drawn_as_hit() -> None:
+    """The ego hits a car that stands below another."""
+    others = car(165, OWN, 0.0, NORTH), car(165, OWN, 0.0, NORTH, z=6.0)
+    segment, _ = segment_of(Case("below", "", ego(8.0, x=165 - 0.9 - 2.25 - 20), others, bridge=6.0), 0.2, 0.0)
+    saved = played(segment)
+    (found,) = contacts([world_of(saved, 0)], np.array([0]))
+    saved.collision[0, found.step[0] - 1 :, 0] = True
+    draw_hit(axes := new_figure(4, 4).add_subplot(), saved_clip(saved))
+    (drawn,) = (artist for artist in axes.get_children() if artist.get_gid() == "hit")
+    assert len(drawn.get_paths()) == len(found.other) == 1

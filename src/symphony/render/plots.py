@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from symphony.data.levels import LEVEL, agent_heights
 from symphony.data.segment import AgentType, RunSegment
 from symphony.render.roads import CORNERS, draw_boxes, draw_roads, draw_signals, draw_trails, pieces, place
 from symphony.render.style import (
@@ -155,12 +156,11 @@ class Clip:
 
 def saved_clip(saved: SavedRollouts, count: int | None = None, title: str | None = None) -> Clip:
     """Return the first ``count`` rollouts of a run segment, all by default, to be drawn or animated."""
-    # The first state is the log's.
-    state = saved.state[:count, 1:].swapaxes(1, 2)
-    valid, collision, offroad = (
-        part[:count].swapaxes(1, 2) for part in (saved.counted, saved.collision, saved.offroad)
-    )
-    place = state[..., :2], state[..., 2], saved.agents, saved.start + 1
+    state, valid = (part[:count].swapaxes(1, 2) for part in (saved.state, saved.there))
+    judged = np.isin(np.arange(len(saved.agents)), saved.evaluated)
+    flags = ((part & judged)[:count].swapaxes(1, 2) for part in (saved.collision, saved.offroad))
+    collision, offroad = (np.pad(part, ((0, 0), (0, 0), (1, 0))) for part in flags)
+    place = state[..., :2], state[..., 2], saved.agents, saved.start
     return Clip(saved.segment, *place, valid, collision, offroad, title=title)
 
 
@@ -280,11 +280,15 @@ def draw_events(
 
 def draw_hit(axes: Axes, clip: Clip) -> Patch | None:
     """Outline the playback agents that were hit, where they were when it began; return a legend entry if any."""
-    segment = clip.segment
+    segment, heights = clip.segment, agent_heights(clip.segment)
     found: set[tuple[int, int]] = set()
     for rollout, rank, at in np.argwhere(clip.beginnings("collision")).tolist():
         step = clip.start + at
         near = clip.others[segment.valid[clip.others, step]]
+        if len(heights):  # as in `symphony.geometry.frames.levels_apart`
+            mine, its = heights[step, clip.agents[rank]], heights[step, near]
+            apart = (its[:, 1] != mine[1]) & (its[:, 1] * mine[1] > 0) & (abs(its[:, 0] - mine[0]) >= LEVEL)
+            near = near[~apart]
         size = segment.size[clip.agents[[rank]]]
         here = clip.position[[rollout], rank, at], clip.heading[[rollout], rank, at], size
         there = segment.position[near, step], segment.heading[near, step], segment.size[near]
@@ -325,8 +329,8 @@ def agent_entries(segment: RunSegment, agents: Any) -> list[Patch]:
     """Return legend entries of the coloured agents, of a crowd the first :data:`ENTRIES`."""
 
     def label(agent: int) -> str:
-        role = "ego" if agent == segment.ego else "interactive"
-        return f"{role} {AgentType(segment.agent_type[agent]).name.lower()} {segment.agent_id[agent]}"
+        role = "ego " if agent == segment.ego else ""
+        return f"{role}{AgentType(segment.agent_type[agent]).name.lower()} {segment.agent_id[agent]}"
 
     colors = colors_of(segment, agents)
     shown = list(zip(agents, colors, strict=True))[:ENTRIES]

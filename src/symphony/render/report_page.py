@@ -88,8 +88,8 @@ def _parts(parts: Mapping[str, Any]) -> str:
     if not parts:
         return ""
     told = [
-        f"{name}: {part['collisions']:g} collisions, {part['red_lights']:g} red lights "
-        f"in {part['agent_minutes']:.1f} minutes of agents"
+        f"{name}: {part['collisions'] or 0} collisions, {'–' if part['red_lights'] is None else part['red_lights']} "
+        f"red lights in {part['agent_minutes']:.1f} minutes of agents"
         for name, part in zip(("in the log", "past its end"), parts.values(), strict=True)
     ]
     return f"<p>Runs go on past the log; {'; '.join(told)}.</p>"

@@ -139,10 +139,12 @@ class _Panel:
         frame(axes, self.view, clip.title or self.segment.segment_id, caption + blanks)
         axes.set_anchor("N")
         self.still = set(axes.get_children())
-        marks = self._draw_moving(self.steps - 1)
+        steps = range(clip.start, clip.start + self.steps)
+        lit = {one.get_label(): one for step in steps for one in draw_signals(axes, self.segment, step, self.view)}
+        marks = lit | {one.get_label(): one for one in self._draw_moving(self.steps - 1)}
         self._remove_moving()
         legend = [*plots.agent_entries(self.segment, clip.agents), Line2D([], [], label="log", **line)]
-        add_legend(axes, [*legend, plots.playback_entry(), *marks, *entries], clip.points)
+        add_legend(axes, [*legend, plots.playback_entry(), *marks.values(), *entries], clip.points)
         self.still = set(axes.get_children())
 
     def above(self) -> list[Artist]:
@@ -212,8 +214,7 @@ def _times(panels: Sequence[_Panel]) -> tuple[NDArray[np.float64], float]:
 def _write(frames: Sequence[NDArray[np.uint8]], path: Path, interval: float) -> None:
     """Write frames [H, W, 3] that follow each other after ``interval`` seconds."""
     # One palette for all: with their own, frames would differ, and flicker, where nothing moves.
-    some = np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]])
-    palette = Image.fromarray(some).quantize(COLORS, Image.Quantize.FASTOCTREE)
+    palette = Image.fromarray(np.concatenate(frames)).quantize(COLORS, Image.Quantize.FASTOCTREE)
     images = [Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE) for pixels in frames]
     # The format counts in hundredths: rounded frame by frame, the error would grow.
     ends = np.rint(100 * interval * np.arange(len(images) + 1)).astype(int)

@@ -183,7 +183,6 @@ class _Network:
             element = _add(cycle, "cycleElement")
             _add(element, "duration", str(len(list(run))))
             _add(element, "color", color)
-        _add(cycle, "timeOffset", "0")
         _point(node, "position", self.segment.signal_point[light, :2] + self.segment.origin[:2])
         _add(node, "direction", turn)
         _add(node, "active", "true")

@@ -51,7 +51,8 @@ def mcap(saved: SavedRollouts, rollout: int) -> bytes:
         writer.add_message(channel, at, kind(**content).SerializeToString(deterministic=True), at, step)
 
     shapes = [(getattr(segment.road, name), *style) for name, style in _ROAD.items()]
-    road = [_line(lines[k], color, width) for lines, color, width in shapes for k in range(len(lines))]
+    deep = np.array([1, 1, world.height is not None])  # boxes on a map without levels are at 0
+    road = [_line(lines[k] * deep, color, width) for lines, color, width in shapes for k in range(len(lines))]
     write("/map", 0, entities=[{"frame_id": "segment", "id": "map", "lines": road}])
     hit = np.zeros_like(world.valid)
     hit[saved.agents, 1:] = (saved.collision[rollout] & saved.counted[rollout]).T
@@ -71,7 +72,7 @@ def mcap(saved: SavedRollouts, rollout: int) -> bytes:
             entities.append(about | {"id": str(segment.agent_id[row]), "cubes": [cube], "lines": lines})
         names = [SignalState(k).name.split("_")[-1] for k in segment.signal_state[:, saved.start + step].tolist()]
         shown = zip(segment.signal_point, names, strict=True)
-        spheres = [_solid(point + MAST, np.ones(3), _LIGHTS[name]) for point, name in shown]
+        spheres = [_solid(point * deep + MAST, np.ones(3), _LIGHTS[name]) for point, name in shown]
         entities.append(about | {"id": "lights", "spheres": spheres})
         write("/traffic", step, deletions=[{"timestamp": stamp, "type": "ALL"}], entities=entities)
         frames = [_transform("source", "segment", segment.origin, 0.0)]

@@ -43,10 +43,13 @@ class Replay {
   constructor(data) {
     Object.assign(this, data);
     this.states = this.steps + 1;
+    // Past the end of the log, those that are driven here have none.
+    const seen = this["log.valid"] = this["log.valid"].slice();
+    for (const row of this.agents) seen.fill(0, row * this.states + Math.min(this.log_end + 1, this.states), (row + 1) * this.states);
     this.rank = new Map(Array.from(this.agents, (row, n) => [row, n]));
     const others = Array.from(this.agents).filter(row => row !== this.ego);
     // The first is the ego's alone.
-    this.color = row => row === this.ego ? PALETTE[0] : PALETTE[1 + others.indexOf(row) % (PALETTE.length - 1)];
+    this.color = row => row === this.ego ? PALETTE[0] : !this.rank.has(row) ? PLAYBACK : PALETTE[1 + others.indexOf(row) % (PALETTE.length - 1)];
   }
 
   // What a driven agent is: one that is evaluated, or background that drives by a rule.

@@ -94,7 +94,7 @@ function choose(rollout) {
 }
 const has = pane => pane.scene && view.rollout < pane.scene.replay.rollouts;
 
-function seek(t) { view.t = Math.min(Math.max(t, 0), scene.replay.steps); dirty = true; }
+function seek(t) { view.t = Math.min(Math.max(+t.toFixed(6), 0), scene.replay.steps); dirty = true; }
 function select(row) {
   view.agent = row;
   if (row !== null && view.follow !== null) view.follow = row;

@@ -214,9 +214,7 @@ def packed_log(saved: SavedRollouts) -> str:
     speed = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
     place = segment.position[:, within, :2]
     packer.states("log", np.concatenate([place, heading[..., None], speed[..., None]], -1))
-    seen = segment.valid[:, within].copy()
-    seen[saved.agents] = saved.logged(saved.agents)
-    packer.add("log.valid", "u8", seen)
+    packer.add("log.valid", "u8", segment.valid[:, within])
     packer.add("size", "i16", segment.size[:, :2], CENTIMETRE)
     packer.add("type", "u8", segment.agent_type)
     for axis, letter in enumerate("xy"):
