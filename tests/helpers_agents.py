@@ -13,10 +13,7 @@ from symphony.config import AgentConfig, AgentSpec, DiscriminatorConfig, SearchC
 
 
 def make_agent(space: Any = "bicycle", cells: int = 0, seed: int = 0, search: Any = (), **more: Any) -> Agent:
-    """Untrained, with goals and a discriminator; a fifth of the time of one that comes with the package.
-
-    The search has settings of its own, and so has all else of the specification.
-    """
+    """Untrained, with goals and a discriminator; a fifth of the time of one that comes with the package."""
     torch.manual_seed(seed)
     spec = AgentSpec(
         action_space=space, dt=0.2, goals=True, agent=AgentConfig(num_points=12, hidden=8, cells=cells),

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import socket
-import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,6 +16,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from helpers_processes import fork
 from helpers_runs import pieces, tiny
 from symphony import keys
 from symphony.agents.choice import choose
@@ -153,24 +153,6 @@ def alone(store: Path, out: Path) -> None:
         train(replace(config("bc", store, out / "bc"), resume=True, steps=6))
     except ConfigError as error:
         (out / "alone.txt").write_text(str(error))
-
-
-def fork(action: Callable[..., None], *args: Any) -> int:
-    """Do something in a process of its own; returns its number."""
-    child = os.fork()
-    if child:
-        return child
-    status = 1
-    try:
-        action(*args)
-        status = 0
-    except BaseException:
-        import traceback
-
-        traceback.print_exc()
-    finally:
-        sys.stderr.flush()
-        os._exit(status)
 
 
 def both(store: Path, out: Path) -> int:

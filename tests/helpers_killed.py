@@ -1,8 +1,4 @@
-"""Training that is killed again and again, in a process of its own that has no threads.
-
-``OUT/whole`` is trained in one go, and ``OUT/killed`` by processes that kill themselves one after the other. Prints
-what they died at.
-"""
+"""Training in one go, ``OUT/whole``, and by processes that kill themselves and say at what, ``OUT/killed``."""
 
 from __future__ import annotations
 
@@ -12,8 +8,8 @@ import signal
 from pathlib import Path
 from typing import Any
 
-import helpers_distributed
 import helpers_runs
+from helpers_processes import fork
 from symphony.config import TrainConfig, ValidationConfig
 from symphony.recipes import train
 from symphony.training import Trainer, hooks
@@ -69,7 +65,7 @@ def live(settings: TrainConfig, death: tuple[str, int, str] | None = None) -> in
             die_at(*death, os.dup(1))
         train(settings)
 
-    return os.waitstatus_to_exitcode(os.waitpid(helpers_distributed.fork(life), 0)[1])
+    return os.waitstatus_to_exitcode(os.waitpid(fork(life), 0)[1])
 
 
 def main(store: Path, out: Path, method: str) -> int:

@@ -1,7 +1,4 @@
-"""Every loss with all that it needs, tiny: for what is true of all of them.
-
-As a program it takes all of them once, after a search, with every tensor checked that a signature speaks of.
-"""
+"""Every loss with all that it needs, tiny; as a program it takes all once, with all signatures of tensors checked."""
 
 from __future__ import annotations
 
@@ -59,6 +56,20 @@ def losses(agent: Any, env: DrivingEnv) -> dict[str, Any]:
     }
 
 
+def world(space: Any, device: Any = "cpu", scenes: Any = SCENES) -> tuple[Any, DrivingEnv]:
+    """An agent, always the same, and an environment, there."""
+    torch.manual_seed(0)
+    agent = build_agent("agent", spec(space)).to(device)
+    return agent, DrivingEnv(scenes.to(device), agent.dynamics, agent.observation)
+
+
+def batch_for(name: str, env: DrivingEnv, device: Any = "cpu") -> TensorDict:
+    """States with what a loss reads; MGAIL acts by itself."""
+    row = torch.arange(ROWS, device=device) % 2
+    batch = batch_of(env, env.start(row, row))
+    return batch.exclude(keys.ACTION) if name == "mgail" else batch
+
+
 def batch_of(env: DrivingEnv, state: TensorDict) -> TensorDict:
     """States with everything that any loss reads."""
     batch = env.choices(env.with_goals(state))
@@ -83,12 +94,9 @@ def searched(agent: Any, env: DrivingEnv, rule: Any, start: TensorDict | None = 
 def main() -> None:
     """Tell of each loss that is a number and has a gradient."""
     for name, space in CASES:
-        agent = build_agent("agent", spec(space))
-        env = DrivingEnv(SCENES, agent.dynamics, agent.observation)
+        agent, env = world(space)
         searched(agent, env, Systematic(0.6))
-        row = torch.arange(ROWS) % 2
-        batch = batch_of(env, env.start(row, row))
-        out = losses(agent, env)[name](batch.exclude(keys.ACTION) if name == "mgail" else batch)
+        out = losses(agent, env)[name](batch_for(name, env))
         total = sum(value for key, value in out.items() if key.startswith("loss"))
         total.backward()
         if total.isfinite():

@@ -19,10 +19,7 @@ from symphony import parallel as engine
 
 
 def serve_from_here() -> None:
-    """Have all processes that are asked for from now on forked from a copy of this one, as it is (Linux).
-
-    A new server would need seconds to import what is imported here.
-    """
+    """Have all processes from now on forked from a copy of this one, as it is, with what it has imported (Linux)."""
     server = forkserver._forkserver
     # Python 3.14's servers want a key; there they begin as in the product.
     if engine._START != "forkserver" or hasattr(server, "_forkserver_authkey"):
@@ -50,19 +47,31 @@ def serve_from_here() -> None:
 
 
 def apart(function: Callable[..., Any], *given: Any, said: Path | None = None) -> BaseProcess:
-    """Start a function of a module with these arguments, which are pickled.
+    """Start a function of a module, whose result is the exit status (``None`` for 0); arguments are pickled.
 
     On Linux its process is forked from one that has imported what this one had when tests began, and has no threads:
-    it may fork, too.
-
-    Args:
-        function: whose result is the exit status, ``None`` for 0.
-        given: its arguments.
-        said: file for what it prints; errors come into a second, whose name ends on ``.err``.
+    it may fork, too. What it prints comes into a file, errors into a second, whose name ends on ``.err``.
     """
     process = multiprocessing.get_context(engine._START).Process(target=_run, args=(function, given, said))
     process.start()
     return process
+
+
+def fork(action: Callable[..., None], *args: Any) -> int:
+    """Do something in a process of its own, forked from this one as it is; returns its number."""
+    sys.stdout.flush()
+    child = os.fork()
+    if child:
+        return child
+    status = 1
+    try:
+        action(*args)
+        status = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(status)
 
 
 def output_of(function: Callable[..., Any], *given: Any, said: Path, limit: float | None = None) -> str:

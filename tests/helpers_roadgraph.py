@@ -8,6 +8,7 @@ import numpy as np
 
 import helpers_segments as segments
 from symphony.data.segment import Polylines
+from symphony.roadgraph import LaneGraph
 
 
 def make_road(lines, edges=(), left=(), right=(), types=None):
@@ -24,6 +25,12 @@ def make_road(lines, edges=(), left=(), right=(), types=None):
         successors=pairs(edges), left_neighbors=pairs(left), right_neighbors=pairs(right),
     )  # fmt: skip
     return road, index
+
+
+def graph_of(made):
+    """The lane graph of a made road, and the index of each name."""
+    road, name = made
+    return LaneGraph(road), name
 
 
 def straight(a, b, spacing=1.0):

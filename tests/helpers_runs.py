@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import inspect
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import checkpoints
 from symphony.config import AgentConfig, DiscriminatorConfig, SearchConfig, TrainConfig
-from symphony.recipes import trainer_of
+from symphony.recipes import train, trainer_of
 from symphony.training import Processes, Trainer
+
+Trained = Callable[[str], Path]
 
 
 def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
@@ -32,6 +37,26 @@ def tiny(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
 def build(config: TrainConfig) -> Trainer:
     """Return what the recipe of a configuration builds, with its hooks, before any training."""
     return trainer_of(config, Processes(torch.device("cpu")))
+
+
+def run_of(config: Callable[[Path, Path], TrainConfig]) -> Any:
+    """A fixture: a run on a module's store, made once; never written to."""
+
+    @pytest.fixture(scope="module")
+    def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return train(config(store, tmp_path_factory.mktemp("runs") / "run"))
+
+    return run
+
+
+def trained_as(config: Callable[[str, Path, Path], TrainConfig]) -> Any:
+    """A fixture: gives the runs of methods on a module's store, made once each; never written to again."""
+
+    @pytest.fixture(scope="module")
+    def trained(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Trained:
+        return cache(lambda method: train(config(method, store, tmp_path_factory.mktemp("runs") / method)))
+
+    return trained
 
 
 def pieces(trainer: Trainer) -> dict[str, Any]:

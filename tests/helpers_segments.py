@@ -54,8 +54,8 @@ def make_segment(
     return validate(segment.replace(**changes))
 
 
-def hide(segment: RunSegment, agent: int, steps: slice) -> RunSegment:
-    """The segment with one agent not seen during some steps."""
+def hide(segment: RunSegment, agent: Any, steps: Any) -> RunSegment:
+    """The segment with one agent not seen during some steps, or agents each at one step."""
     fields = {name: getattr(segment, name).copy() for name in schema.STATES}
     for array in fields.values():
         array[agent, steps] = 0

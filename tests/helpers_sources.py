@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+import tracemalloc
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,18 @@ IN_FOLDER = settings(deadline=None, max_examples=25, suppress_health_check=[Heal
 """Of laws whose examples are written into one folder."""
 FAR = np.array([-7792.0, 81234.0, -184.0])
 """Where the made WOMD scenarios lie: far enough that float32 would lose millimetres."""
+
+
+@contextmanager
+def little_memory(most: float) -> Iterator[None]:
+    """Check that what is allocated inside stays below a number of bytes."""
+    tracemalloc.start()
+    try:
+        yield
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < most
 
 
 def read_one(name: str, path: Path, **options: object) -> RunSegment:

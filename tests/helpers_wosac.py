@@ -8,10 +8,13 @@ import numpy as np
 
 from helpers_sources import womd_scenario
 from symphony.data.sources import womd_pb2 as pb
+from symphony.wosac.meta import SubmissionMeta
 from symphony.wosac.scorer import SimulatedRollouts, WosacScenario
 
 ROAD = np.array([(-200.0, -8.0, 0.0), (0.0, -8.0, 0.0), (200.0, -8.0, 0.0)])
 """Right edge of a road along +x; the drivable side is on its left."""
+MADE = ("somebody@example.org", "made", False, False, False, "200K", True)
+META = SubmissionMeta(*MADE, authors=("A", "B"), affiliation="Nowhere")
 
 
 def made_scenario(agents: int = 4, seed: int = 0, **changes: Any) -> WosacScenario:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from helpers_runs import build, tiny
 from helpers_segments import crossing, straight_road
-from helpers_store import fill
+from helpers_store import stored
 from symphony.agents.choice import choose
 from symphony.cli import main
 from symphony.objectives import BCLoss
@@ -85,13 +85,7 @@ def test_a_run_that_goes_on_rings_as_if_it_had_not_stopped(values: list[float | 
     assert [later.check({"discriminator_auc": value}) for value in values[stop:]] == alarms(*values)[stop:]
 
 
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("data") / "store"
-    fill(path, [straight_road(4, seed=0, steps=5), crossing(4, seed=0, steps=5)])
-    return path
-
-
+store = stored(lambda: [straight_road(4, seed=0, steps=5), crossing(4, seed=0, steps=5)])
 Altered = Callable[[Callable[[int], dict[str, float]]], None]
 
 

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-import tracemalloc
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +14,16 @@ from hypothesis import strategies as st
 
 import helpers_sources as sources
 from helpers_convert import FakeReader
-from helpers_sources import IN_FOLDER, ROAD, commonroad, driver, read_error, womd_scenario, write_records
+from helpers_sources import (
+    IN_FOLDER,
+    ROAD,
+    commonroad,
+    driver,
+    little_memory,
+    read_error,
+    womd_scenario,
+    write_records,
+)
 from symphony.data import convert as converting
 from symphony.data.convert import convert
 from symphony.data.segment import RunSegment, content_hash, validate
@@ -185,18 +191,6 @@ def test_commonroad_odd_things(old: str, new: str, kind: str, example: str, tmp_
         convert("commonroad", [path], tmp_path / "strict", interactive=1, strict=True)
 
 
-@contextmanager
-def little_memory(most: float) -> Iterator[None]:
-    """Check that what is allocated inside stays below a number of bytes."""
-    tracemalloc.start()
-    try:
-        yield
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert peak < most
-
-
 def test_many_parked_cars_one_late_state_and_files_beyond_all_measure(tmp_path, monkeypatch):
     path = tmp_path / "a.xml"
     parked = [sources.obstacle(100 + k, [sources.state(0, k, 5)], role="static") for k in range(700)]
@@ -256,27 +250,15 @@ def test_argoverse_rows_and_texts_beyond_all_measure(tmp_path: Path) -> None:
     assert (error.field, error.message) == ("track_id", "expected string, is list<element: string>")
 
 
-class Fragile(FakeReader):
-    """Fails on every word that it does not know, as readers may on what nobody has thought of."""
-
-    def _read(self, path: Path) -> Iterator[Item]:
-        for line in path.read_text().splitlines():
-            if line == "fail":
-                raise TypeError("unhashable type: 'list'")
-            (tmp := path.with_suffix(".one")).write_text(line)
-            yield from super()._read(tmp)
-            tmp.unlink()
-
-
 @pytest.mark.parametrize("workers", [1, 2])
 def test_whatever_a_reader_raises_is_counted(workers: int, tmp_path: Path) -> None:
     paths = []
     for k, text in enumerate(("straight 1\nfail\nstraight 2", "straight 3")):
         paths.append(tmp_path / f"{k}.scene")
         paths[-1].write_text(text)
-    report = convert(Fragile(), paths, tmp_path / "out", workers=workers)
+    report = convert(FakeReader(), paths, tmp_path / "out", workers=workers)
     assert report.converted == 2
-    assert report.reasons == {"can't be read: TypeError: unhashable type: 'list'": 1}
+    assert report.reasons == {"can't be read: ValueError: invalid literal for int() with base #: ''": 1}
     assert report.skipped[0].file == str(paths[0])
 
 

@@ -31,10 +31,11 @@ from symphony.envs.objects import Objects, Observers, objects_at, rollout_height
 from symphony.envs.observation import nearest_points, observed_points
 from symphony.envs.scene import PointType, Tables
 from symphony.evaluation import evaluate
-from symphony.geometry import LEVEL, NO_BOUNDARY, levels_apart, segments_of
+from symphony.geometry import LEVEL, NO_BOUNDARY, levels_apart
 from symphony.geometry.cells import PointCells
 from symphony.geometry.nearest import nearest, smallest
 from symphony.saved.rollouts import world_of
+from test_geometry import closed, segments, star
 
 FEW = ObservationConfig(num_objects=4, num_points=60)
 
@@ -131,18 +132,11 @@ def test_acute_corners_have_the_side_that_the_distance_says(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rings = [np.array([[90.0, 90], [110, 91], [90, 92], [90, 90]])[:: rng.choice([-1, 1])]]  # acute first
     for centre in rng.uniform(-80, 80, (12, 2)):
-        angle = np.sort(rng.uniform(0, 2 * np.pi, 7)) + np.linspace(0, 0.1, 7)
-        ring = centre + rng.uniform(1, 20, (7, 1)) * np.stack([np.cos(angle), np.sin(angle)], -1)
-        rings.append(np.concatenate([ring, ring[:1]])[:: rng.choice([-1, 1])])
-    start, end, previous, following = segments_of(np.concatenate(rings), np.cumsum([0, *map(len, rings)]))
-    given = scene(straight_road())
-    given = given.replace(
-        edge_start=torch.from_numpy(start)[None].float(), edge_end=torch.from_numpy(end)[None].float(),
-        edge_valid=torch.ones(1, len(start), dtype=torch.bool),
-        edge_previous=torch.from_numpy(previous)[None], edge_following=torch.from_numpy(following)[None],
-    )  # fmt: skip
+        rings.append(closed(star(rng, 7, centre, 1, 20))[:: rng.choice([-1, 1])])
+    edges = segments(rings, torch.float32)
+    given = scene(straight_road()).replace(**dict(zip(_EDGES, edges, strict=True)))
     batch, row = collate([given]), torch.zeros(1, dtype=torch.int64)
-    corner = torch.from_numpy(start).float().repeat(60, 1)
+    corner = edges[0][0].repeat(60, 1)
     where = (corner + 1.5 * torch.from_numpy(rng.normal(size=corner.shape)).float())[None]
     tables = Tables(batch, FEW)
     expected = oracle.road_distance(batch, row, where)
@@ -260,10 +254,7 @@ def line(axis: int, across: float, height: float, back: bool = False) -> NDArray
 
 
 def overpass(height: float = HIGH, slope: float = 0.0, turn: float = 0.0) -> RunSegment:
-    """A road along x, and one along y that crosses it at a height; a car on each, both at the crossing at 4 s.
-
-    All climbs along x, and the world is turned.
-    """
+    """A road along x, and one along y at a height; a car on each is at the crossing at 4 s. All climbs along x."""
     half = LANE_WIDTH / 2
     lanes = [line(0, 0, 0), line(1, 0, height)]
     boundary = [
@@ -365,6 +356,18 @@ def test_saved_rollouts_are_as_high_as_in_the_simulation() -> None:
         np.testing.assert_array_equal(found[[1, 0]], expected[0, k].transpose(0, 1))
         np.testing.assert_array_equal(found[2], agent_heights(segment)[4:, 2])
     assert world_of(played(overpass(0.0)), 0).height is None
+
+
+def test_padded_slots_leave_everyone_as_high_as_they_are() -> None:
+    """Agent 0 of the first scene plays back the log, up a slope."""
+    scenes, found = [scene(overpass(HIGH, slope=0.03), [1]), scene(straight_road(3, steps=STEPS), [0, 1])], []
+    for batch in (scenes[:1], scenes):
+        env, first = DrivingEnv(collate(batch), observation=SEEN), torch.tensor([0])
+        state = env.start(first)
+        found.append(
+            env.objects(first, first + STEPS - 1, state.get(keys.STATE), state.get(keys.VALID)).height[0, :3]
+        )
+    torch.testing.assert_close(*found)
 
 
 def test_flat_scenes_beside_it_keep_every_number() -> None:

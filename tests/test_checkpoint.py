@@ -20,7 +20,7 @@ from torch import nn
 
 from helpers_runs import tiny
 from helpers_segments import CHARACTERS, crossing
-from helpers_store import fill
+from helpers_store import contents, stored
 from symphony.agents import checkpoint as module
 from symphony.agents.checkpoint import MANIFEST, CheckpointError, checkpoints, load_checkpoint, save_checkpoint
 from symphony.agents.choice import choose
@@ -326,10 +326,7 @@ def test_weights_that_are_not_finite_are_refused(value, tmp_path):
     assert torch.equal(before, own["modules"]["policy"][0].weight)
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Path:
-    fill(tmp_path / "store", [crossing(seed=k, steps=5) for k in range(3)])
-    return tmp_path / "store"
+store = stored(lambda: [crossing(seed=k, steps=5) for k in range(3)])
 
 
 def test_what_a_run_keeps_is_looked_at_when_it_goes_on(store, tmp_path):
@@ -354,7 +351,6 @@ def test_equal_runs_write_equal_checkpoints(store, tmp_path):
         np.random.seed(seed)  # noqa: NPY002
         torch.manual_seed(seed)
         train(tiny("bc_ts_h", store, tmp_path / name, seed=5))
-    kept = [(tmp_path / name / "checkpoints").glob("*/*") for name in "ab"]
-    one, other = ({(file.parent.name, file.name): file.read_bytes() for file in files} for files in kept)
+    one, other = (contents(tmp_path / name / "checkpoints") for name in "ab")
     assert len(one) > 6
     assert one == other

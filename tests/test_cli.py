@@ -9,7 +9,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -21,10 +20,11 @@ from tensordict import TensorDict, nn
 
 import symphony.data.convert
 from helpers_cli import commands, words
+from helpers_convert import FakeReader
 from helpers_processes import apart, forget, output_of
 from helpers_saved import played
 from helpers_segments import crossing, straight_road
-from helpers_store import fill
+from helpers_store import stored
 from symphony import __version__
 from symphony.agents import Agent, discriminator_network, goal_network, policy_network
 from symphony.bench.measures import MEASURES
@@ -35,8 +35,6 @@ from symphony.cli.recipe import Arguments
 from symphony.cli.shared import print_table
 from symphony.config import METHODS, TrainConfig
 from symphony.config.profiles import PROFILES, expanded
-from symphony.data.segment import RunSegment
-from symphony.data.sources import Reader
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
@@ -44,24 +42,7 @@ from symphony.saved.folder import About, save_rollouts
 
 LINES = (Path(__file__).parent / "cli.txt").read_text().splitlines()
 HEAVY = {"torch", "torchrl", "tensordict", "wandb", "matplotlib", "numpy", "shapely", "google"}
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Path:
-    fill(tmp_path / "store", [crossing(), straight_road(4, segment_id="straight")])
-    return tmp_path / "store"
-
-
-class MadeReader(Reader):
-    """Gives one good segment and two broken records for each file."""
-
-    name = "made"
-    patterns = ("*.made",)
-
-    def _read(self, path: Path) -> Iterator[RunSegment | DataError]:
-        yield straight_road(6, segment_id=path.stem)
-        yield DataError("has 3 wheels", file=path, segment="tricycle", field="agents")
-        yield DataError("has 5 wheels", file=path, segment="spare", field="agents")
+store = stored(lambda: [crossing(), straight_road(4, segment_id="straight")])
 
 
 def help_of_all() -> None:
@@ -100,20 +81,6 @@ def test_what_users_type_changes_on_purpose_only(told: dict[str, str]) -> None:
     )
 
 
-@pytest.mark.parametrize(("args", "told"), [
-    ("plot curves --out a.png", "give at least 1 RUN ..."),
-    ("table --setting main --runs", "give at least 1 --runs"),
-    ("data info x --interactive -1", "--interactive must not be negative, is -1"),
-    ("hunt x --planner idm --data y --out z --trees 1", "--trees must be at least 4, is 1"),
-    ("plot curves x --out a.png --window 2", "--window must be at most 1, is 2.0"),
-    ("data convert womd x --out y --rate nan", "--rate must be a number, is nan"),
-    ("data generate --out y --count 1 --kinds random", "(known: town, grid, ramp, and files of roads"),
-])  # fmt: skip
-def test_bounds_are_told_as_they_are_typed(args: str, told: str, capsys: Any) -> None:
-    assert main(args.split()) == 2
-    assert told in capsys.readouterr().err
-
-
 def test_what_is_required_shows_no_default(told: dict[str, str]) -> None:
     for command in ("plot curves", "data merge", "table", "planners"):
         assert re.search(r"\.\.\. +[A-Z][^()]*(\([^()]*\)[^()]*)?\(required\)", told[command]), command
@@ -135,32 +102,32 @@ WRONG = """
 nonsense
 data
 data info
-data info x --interactive -1
+data info x --interactive -1 => --interactive must not be negative, is -1
 data convert nonsense x --out y
 data convert womd x
 data convert womd --out y
 data convert womd x --out y --egos all
 data convert womd x --out y --window 4
 data generate --out y
-data convert womd x --out y --rate nan
+data convert womd x --out y --rate nan => --rate must be a number, is nan
 data convert womd x --out y --interactive -3
 data convert womd x --out y --radius nan
 data convert interaction x --out y --stride 0
 data generate --out y --preset town --seed 1
-data generate --out y --count 1 --kinds random
+data generate --out y --count 1 --kinds random => (known: town, grid, ramp, and files of roads
 train bc --data x --out y --steps many
 train bc --data x --out y --steps 0
 evaluate --data x
 evaluate playback --data x --unknown 1
-plot curves --out a.png
+plot curves --out a.png => give at least 1 RUN ...
 plot curvature --out a.png
 table --setting main
-table --setting main --runs
+table --setting main --runs => give at least 1 --runs
 table --setting short --runs x
 plot curves x --out a.png --window nan
-plot curves x --out a.png --window 1.1
+plot curves x --out a.png --window 1.1 => --window must be at most 1, is 1.1
 hunt x --planner idm --data y --out z --metric nonsense
-hunt x --planner idm --data y --out z --trees 1
+hunt x --planner idm --data y --out z --trees 1 => --trees must be at least 4, is 1
 demo --steps -1
 simulate playback --data x --out y --threshold nan
 simulate playback --data x --out y --planner-seconds nan
@@ -172,12 +139,14 @@ wosac submit playback --data x --out y --horizon 4
 """
 
 
-@pytest.mark.parametrize("args", WRONG.splitlines()[1:])
-def test_wrong_usage_is_status_2(args: str, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+@pytest.mark.parametrize("line", WRONG.splitlines()[1:])
+def test_wrong_usage_is_status_2_and_bounds_are_told_as_they_are_typed(line, tmp_path, monkeypatch, capsys):
+    args, _, told = line.partition(" => ")
     monkeypatch.chdir(tmp_path)
     assert main(args.split()) == 2
     captured = capsys.readouterr()
     assert captured.out == "" != captured.err.strip()
+    assert told in captured.err
     assert not list(tmp_path.iterdir())
 
 
@@ -220,17 +189,17 @@ def test_a_closed_pipe_is_no_traceback(store: Path, tmp_path: Path) -> None:
 
 
 def test_convert_reports_what_it_did(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
-    monkeypatch.setattr(symphony.data.convert, "get_reader", lambda name, **options: MadeReader())
-    logs, out = [str(tmp_path / name) for name in ("one.made", "two.made")], tmp_path / "out"
-    for file in logs:
-        Path(file).touch()
+    monkeypatch.setattr(symphony.data.convert, "get_reader", lambda name, **options: FakeReader())
+    logs, out = [str(tmp_path / f"{k}.scene") for k in (1, 2)], tmp_path / "out"
+    for k, file in enumerate(logs):
+        Path(file).write_text(f"straight {k}\nbroken 1\nbroken 2")
     options = ["--out", str(out), "--rate", "2.5", "--interactive", "3", "--smooth", "0.1"]
     assert main(["data", "convert", "womd", *logs, *options]) == 0
     captured = capsys.readouterr()
     rows = [" ".join(line.split()) for line in captured.out.splitlines()]
-    assert {"segments 2", "agents: has # wheels 4"} <= {*rows}
+    assert {"segments 2", "tracks: # is not # 4"} <= {*rows}
     assert "2 converted, 4 skipped" in captured.err
-    assert SegmentStore(out).ids == ["one", "two"]
+    assert SegmentStore(out).ids == ["straight-0", "straight-1"]
     assert SegmentStore(out)[0].dt == pytest.approx(0.4)
     assert main(["data", "convert", "interaction", *logs, "--out", f"{out}-2", "--window", "4", "--egos", "all"]) == 0
     settings = SegmentStore(out).report["settings"]
@@ -266,7 +235,7 @@ def test_plot_refuses_what_it_cannot_draw(store: Path, change: str, tmp_path: Pa
     error = capsys.readouterr().err
     assert error.startswith("symphony: error: ")
     assert error.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+    assert not list(tmp_path.iterdir())
 
 
 def look(folder: Path, commands: tuple[str, ...], needless: set[str]) -> None:

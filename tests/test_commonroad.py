@@ -225,10 +225,19 @@ CYCLE = "".join(
     f"<cycleElement><duration>{steps}</duration><color>{color}</color></cycleElement>"
     for steps, color in ((3, "green"), (1, "yellow"), (4, "red"))
 )
-APPROACH = '<successor ref="11"/><successor ref="12"/><trafficLightRef ref="30"/>'
-FORK = lanelet(10, [(0, 2), (50, 2)], [(0, -2), (50, -2)], APPROACH)
-for target, dy in ((11, 0), (12, 30)):
-    FORK += lanelet(target, [(50, 2), (100, 2 + dy)], [(50, -2), (100, -2 + dy)])
+
+
+def forked(more: str = "") -> list[str]:
+    """A lane along +x that forks after 50 m: 11 goes straight on, 12 to the left."""
+    links = f'<successor ref="11"/><successor ref="12"/>{more}'
+    stem = lanelet(10, [(0, 2), (50, 2)], [(0, -2), (50, -2)], links)
+    ahead = lanelet(11, [(50, 2), (150, 2)], [(50, -2), (150, -2)], '<predecessor ref="10"/>')
+    turn = np.radians(np.arange(0, 91, 10))
+    rings = [np.stack([50 + r * np.sin(turn), 40 - r * np.cos(turn)], -1).tolist() for r in (38, 42)]
+    return [stem, ahead, lanelet(12, *rings, '<predecessor ref="10"/>')]
+
+
+FORK = "".join(forked('<trafficLightRef ref="30"/>'))
 TURNS = (
     '<intersection id="40"><incoming id="41"><incomingLanelet ref="10"/>'
     '<successorsStraight ref="11"/><successorsLeft ref="12"/></incoming></intersection>'
@@ -271,15 +280,6 @@ def problem(goal: str, number: int = 100, x: float = 5.0) -> str:
 
 
 AREA = "<rectangle><length>4</length><width>3</width><center><x>90</x><y>33</y></center></rectangle>"
-
-
-def forked() -> list[str]:
-    """A lane along +x that forks after 50 m: 11 goes straight on, 12 to the left."""
-    stem = lanelet(10, [(0, 2), (50, 2)], [(0, -2), (50, -2)], '<successor ref="11"/><successor ref="12"/>')
-    ahead = lanelet(11, [(50, 2), (150, 2)], [(50, -2), (150, -2)], '<predecessor ref="10"/>')
-    turn = np.radians(np.arange(0, 91, 10))
-    rings = [np.stack([50 + r * np.sin(turn), 40 - r * np.cos(turn)], -1).tolist() for r in (38, 42)]
-    return [stem, ahead, lanelet(12, *rings, '<predecessor ref="10"/>')]
 
 
 def problems_of(path: Path, *parts: str) -> list[RunSegment]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers_segments import crossing, hide, straight_road
+from helpers_segments import crossing, hide, straight_road, turned
 from helpers_sources import ROAD, commonroad, driver, womd_scenario, write_records
 from symphony.data.conformance import Conformance, ConformanceError, check_reader, check_segments
 from symphony.data.segment import AgentType, Polylines, RunSegment
@@ -95,17 +95,6 @@ def scaled(name: str, factor: float) -> Callable[[RunSegment], RunSegment]:
     return lambda s: s.replace(**{name: getattr(s, name) * np.float32(factor)})
 
 
-def moved(s: RunSegment, by: float) -> RunSegment:
-    """The whole world somewhere else."""
-    shift = np.float32([by, 0, 0])
-
-    def lines(old: Polylines) -> Polylines:
-        return Polylines(old.points + shift, old.offsets)
-
-    position = np.where(s.valid[..., None], s.position + shift, 0).astype(np.float32)
-    return road(lanes=lines, boundary=lines, marks=lines)(s.replace(position=position))
-
-
 def leftover(s: RunSegment) -> RunSegment:
     heading = s.heading.copy()
     heading[~s.valid] = 1.5
@@ -137,13 +126,13 @@ BROKEN: dict[str, tuple[Callable[[RunSegment], RunSegment], set[str]]] = {
     "velocity in mph": (scaled("velocity", 2.237), {"speed"}),
     "velocity backwards": (scaled("velocity", -1), {"speed", "heading"}),
     "all in feet": (
-        lambda s: moved(s, 0).replace(position=s.position * np.float32(3.28), size=s.size * np.float32(3.28)),
+        lambda s: s.replace(position=s.position * np.float32(3.28), size=s.size * np.float32(3.28)),
         {"speed", "size", "lanes", "boundary"},
     ),
     "heading in degrees": (scaled("heading", 180 / np.pi), {"heading"}),
     "heading clockwise": (scaled("heading", -1), {"heading"}),
     "length is width": (swapped, {"size"}),
-    "far away": (lambda s: moved(s, 3000), {"re-centred"}),
+    "far away": (lambda s: turned(s, 0.0, [3000, 0]), {"re-centred"}),
     "left over numbers": (leftover, {"masked"}),
     "lanes against the traffic": (
         road(lanes=turned_around, successors=flipped, left_neighbors=flipped, right_neighbors=flipped),

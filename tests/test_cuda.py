@@ -1,7 +1,4 @@
-"""A real card: the numbers of the CPU within rounding, the same bits each time, and no waiting within a step.
-
-What needs no card is tested by ``test_fake_device*.py``, everywhere.
-"""
+"""A real card: the numbers of the CPU within rounding, the same bits each time, and no waiting within a step."""
 
 from __future__ import annotations
 
@@ -9,23 +6,20 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 
-from helpers_losses import CASES, LOGGED, ROWS, SCENES, batch_of, losses, searched, spec
+from helpers_losses import CASES, LOGGED, batch_for, losses, searched, world
 from helpers_runs import same_weights, stopped, tiny, weights
 from helpers_segments import crossing, straight_road
-from helpers_store import fill
+from helpers_store import stored
 from symphony import keys
-from symphony.agents import build_agent
 from symphony.collectors import KeepBest, Systematic
 from symphony.config import EvaluateConfig, MGAILConfig
 from symphony.data.store import SegmentStore
-from symphony.envs import DrivingEnv
 from symphony.evaluation import evaluate
 from symphony.modules import SeededNoise
 from symphony.recipes import train
@@ -33,13 +27,6 @@ from symphony.rollouts.unroll import simulate, start_states
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 CUDA = "cuda"
-
-
-def world(space: Any, device: str) -> tuple[Any, DrivingEnv]:
-    """An agent, always the same, and an environment, there."""
-    torch.manual_seed(0)
-    agent = build_agent("agent", spec(space)).to(device)
-    return agent, DrivingEnv(SCENES.to(device), agent.dynamics, agent.observation)
 
 
 @contextmanager
@@ -87,10 +74,7 @@ def test_searches(rule):
 
 def loss_and_gradients(name: str, space: str, device: str) -> tuple[TensorDict, dict[str, torch.Tensor]]:
     agent, env = world(space, device)
-    loss = losses(agent, env)[name]
-    row = torch.arange(ROWS, device=device) % 2
-    batch = batch_of(env, env.start(row, row))
-    batch = batch.exclude(keys.ACTION) if name == "mgail" else batch
+    loss, batch = losses(agent, env)[name], batch_for(name, env, device)
 
     def total() -> TensorDict:
         torch.manual_seed(0)
@@ -120,11 +104,7 @@ def test_losses_and_their_gradients(name, space):
             torch.testing.assert_close(there[key], value, atol=1e-4, rtol=1e-3, msg=key)
 
 
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("data") / "store"
-    fill(path, [make(4, seed=seed, steps=6) for seed in range(2) for make in (straight_road, crossing)])
-    return path
+store = stored(lambda: [make(4, seed=seed, steps=6) for seed in range(2) for make in (straight_road, crossing)])
 
 
 @pytest.mark.parametrize("method", ["bc_ts_h", "bc_rl_h", "mgail_ts_h"])

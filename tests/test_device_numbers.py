@@ -12,10 +12,9 @@ import torch
 from tensordict import assert_close
 from torch import Tensor
 
-from helpers_losses import CASES, ROWS, SCENES, batch_of, losses, searched, spec
+from helpers_losses import CASES, batch_for, losses, searched, world
 from helpers_segments import crossing, ring, straight_road
 from symphony import keys
-from symphony.agents import build_agent
 from symphony.collectors import Systematic
 from symphony.envs import Displacement, DrivingEnv, ObservationConfig, collate, scene
 from symphony.roadgraph import LaneGraph
@@ -77,13 +76,9 @@ def test_a_device_sees_and_flags_the_same(counts, seed, monkeypatch):
 
 @pytest.mark.parametrize(("name", "space"), CASES)
 def test_a_device_learns_the_same(name, space, monkeypatch):
-    torch.manual_seed(0)
-    agent = build_agent("agent", spec(space))
-    env = DrivingEnv(SCENES, agent.dynamics, agent.observation)
-    row = torch.arange(ROWS) % 2
-    loss, batch = losses(agent, env)[name], batch_of(env, env.start(row, row))
-    batch[keys.GOAL_SET] = batch[keys.ROUTES_MASK] & (torch.arange(batch[keys.ROUTES_MASK].shape[-1]) == 0)
-    given = batch.exclude(keys.ACTION) if name == "mgail" else batch
+    agent, env = world(space)
+    loss, given = losses(agent, env)[name], batch_for(name, env)
+    given[keys.GOAL_SET] = given[keys.ROUTES_MASK] & (torch.arange(given[keys.ROUTES_MASK].shape[-1]) == 0)
     found = differentiated(loss, given)
     as_on_a_device(monkeypatch)
     largest = max(float(gradient.abs().max()) for gradient in found[1:])
@@ -104,9 +99,7 @@ def differentiated(loss: Any, given: Any) -> list[Tensor]:
 
 @torch.no_grad()
 def test_a_device_finds_the_same(monkeypatch):
-    torch.manual_seed(0)
-    agent = build_agent("agent", spec("bicycle"))
-    env = DrivingEnv(SCENES, agent.dynamics, agent.observation)
+    agent, env = world("bicycle")
     found = searched(agent, env, Systematic(0.6))
     as_on_a_device(monkeypatch)
     there = searched(agent, env, Systematic(0.6))

@@ -19,7 +19,6 @@ from torch import Tensor
 from helpers_runs import tiny
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
-from symphony import keys
 from symphony.cli import main
 from symphony.config import PerturbConfig
 from symphony.data.builtin import builtin_store
@@ -74,19 +73,6 @@ def test_experts_drive_or_wait_in_a_lane_and_are_not_parked() -> None:
     assert found.agent.tolist() == [0, 1, 3]
     assert found.error.max() < 0.15
     assert (found.actions[1] == 73).all()  # who waits neither steers nor brakes
-
-
-@DYNAMICS
-def test_expert_batches_show_what_the_environment_shows(dynamics: Any, tmp_path: Path) -> None:
-    fill(tmp_path / "store", [straight_road(4, steps=11), crossing(4, steps=16)])
-    dataset = SceneDataset(SegmentStore(tmp_path / "store"), 2, dynamics)
-    sees, rng = ObservationConfig(num_objects=4, num_points=20), torch.Generator().manual_seed(0)
-    batch = dataset.sample_states([0, 1], 50, sees, rng)
-    assert batch[keys.POINTS].shape == (50, 1, 20, 23)
-    assert batch[keys.VALID].all()
-    assert batch[keys.OWN][..., 0].mean() > 0.3  # everybody drives at 6 to 15 m/s
-    seen = batch[keys.OBJECTS][..., :2][batch[keys.OBJECTS_MASK]]
-    assert seen.norm(dim=-1).min() * 20 > 1  # nobody sees itself
 
 
 @pytest.mark.parametrize("split", ["train", "test"])

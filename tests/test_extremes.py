@@ -18,8 +18,8 @@ from tensordict.nn import TensorDictModuleBase
 
 from helpers_agents import make_agent
 from helpers_runs import build, tiny
-from helpers_segments import crossing, make_road, make_segment, straight_road
-from helpers_store import fill
+from helpers_segments import crossing, hide, make_road, make_segment, straight_road
+from helpers_store import fill, stored
 from symphony import keys
 from symphony.agents import Agent
 from symphony.config import AgentConfig, EvaluateConfig, MGAILConfig, ValidationConfig
@@ -47,11 +47,7 @@ def with_road(segment: schema.RunSegment, **changes: Any) -> schema.RunSegment:
 
 def only(segment: schema.RunSegment, seen: Any) -> schema.RunSegment:
     """With agents seen at some steps [A, T] only."""
-    valid = np.broadcast_to(np.asarray(seen, bool), segment.valid.shape).copy()
-    zero = {name: getattr(segment, name).copy() for name in ("position", "heading", "velocity")}
-    for array in zero.values():
-        array[~valid] = 0
-    return segment.replace(valid=valid, **zero)
+    return hide(segment, *np.nonzero(~np.broadcast_to(seen, segment.valid.shape)))
 
 
 def moving(speed, *, dt=0.2, agents=2, steps=STEPS, heading=0.0):
@@ -121,7 +117,6 @@ SCENES: dict[str, Callable[[], schema.RunSegment]] = {
     "a map of two points": lambda: road().replace(road=make_road([line((0, 0), (1, 0))])),
     "a lane of one point": lambda: road().replace(road=make_road([line((30, 0))])),
     "a lane of one place": lambda: road().replace(road=make_road([line(*[(30, 0)] * 5)])),
-    "no boundary and no marks": lambda: road().replace(road=make_road([line((0, 0), (200, 0))])),
     "a lane of 30 km": lambda: road().replace(road=make_road([line((-15_000, 0), (15_000, 0))])),
     "a lane that turns back and follows itself": zigzag,
     "a tangle of lanes": tangle,
@@ -209,12 +204,8 @@ def test_other_time_steps(scenes, dt, tmp_path):
 LENGTHS = (5, 3, 5)
 """Steps of the segments ``straight-0``, ``crossing-1`` and ``crossing-2``."""
 SEARCHES = (("none", "best"), ("tree", "systematic"), ("backtrack", "best"))
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> SegmentStore:
-    crossings = [crossing(4, seed=k, steps=LENGTHS[k]) for k in (1, 2)]
-    return fill(tmp_path_factory.mktemp("data") / "store", [straight_road(4, steps=LENGTHS[0]), *crossings])
+CROSSINGS = [crossing(4, seed=k, steps=LENGTHS[k]) for k in (1, 2)]
+store = stored(lambda: [straight_road(4, steps=LENGTHS[0]), *CROSSINGS], opened=True)
 
 
 class Spoiled(TensorDictModuleBase):

@@ -1,5 +1,4 @@
-"""Steps, searches and losses on a device that isn't the CPU: nothing mixes devices or waits for it, and all tensors
-are what signatures say."""
+"""Steps, searches and losses on a device that isn't the CPU: nothing mixes devices or waits; what signatures say."""
 
 from __future__ import annotations
 
@@ -12,12 +11,12 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorDeviceMismatchError
 
+import helpers_losses
 from helpers_device import NAME, on, pretend
-from helpers_losses import CASES, LOGGED, ROWS, SCENES, batch_of, losses, searched, spec
+from helpers_losses import CASES, LOGGED, ROWS, SCENES, batch_of, losses, searched
 from helpers_processes import forget, output_of
 from helpers_segments import crossing, straight_road
 from symphony import keys, objectives
-from symphony.agents import build_agent
 from symphony.collectors import Systematic
 from symphony.envs import Bicycle, DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.scene import map_edge
@@ -43,8 +42,7 @@ def placed(env, *parts):
 
 @contextmanager
 def world(space="bicycle"):
-    agent = build_agent("agent", spec(space))
-    env = DrivingEnv(SCENES, agent.dynamics, agent.observation)
+    agent, env = helpers_losses.world(space)
     with placed(env, *agent.modules.values()) as device:
         yield device, agent, env
 
@@ -143,7 +141,6 @@ def test_losses_and_their_gradients_stay_on_the_device(space):
 
 
 def test_every_loss_is_among_them():
-
     with world() as (_, agent, env):
         known = {type(loss) for loss in losses(agent, env).values()}
     there = [getattr(objectives, name) for name in objectives.__all__ if name.endswith("Loss")]

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from symphony import geometry
 from symphony.geometry.frames import forward_speed, with_speed
-from symphony.metrics import collisions
 
 coordinate = st.floats(-6, 6)
 angle = st.floats(-7, 7)
@@ -149,19 +148,6 @@ def test_a_contact_is_where_many_small_steps_find_one(a, b, c, d, size, turn):
     else:
         # What is missed is a graze.
         assert not deep.any() or shared.max() < 6 * slack
-
-
-@settings(max_examples=25)
-@given(st.integers(0, 2**32 - 1))
-def test_between_states_nothing_is_lost_that_states_show(seed):
-    rng = np.random.default_rng(seed)
-    position = torch.tensor(rng.uniform(0, 30, (2, 6, 1, 2)) + rng.normal(0, 2, (2, 6, 5, 2)))
-    heading = torch.tensor(rng.uniform(-7, 7, (2, 6, 5)))
-    size, valid = torch.tensor(rng.uniform(0.4, 5, (2, 6, 2))), torch.tensor(rng.random((2, 6, 5)) < 0.8)
-    subject = torch.tensor([[0, 1, 2], [3, 4, -1]])
-    at_states = collisions(position, heading, size, valid, subject, at_states=True)
-    between = collisions(position, heading, size, valid, subject)
-    assert (between | ~at_states[..., 1:]).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -15,12 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from helpers_segments import make_road, straight_road
+from helpers_convert import FakeReader
+from helpers_segments import make_road
 from symphony.data.convert import convert, info, merge
 from symphony.data.joins import REACH, SAME, TURN, joined
 from symphony.data.report import Report
 from symphony.data.segment import LaneType, RoadMap
-from symphony.data.sources.base import Item, Reader
+from symphony.data.sources.base import Item
 from symphony.data.store import SegmentStore
 
 
@@ -97,14 +98,11 @@ def test_ends_that_only_look_like_it() -> None:
     assert joined(make_road([line((0, 0)), line((0, 0), (0, 0))]))[1] == 0
 
 
-class Cut(Reader):
-    """A road in two pieces, one segment for each line of the file."""
-
-    name, patterns = "cut", ("*.cut",)
+class Cut(FakeReader):
+    """Each lane is in two pieces."""
 
     def _read(self, path: Path) -> Iterator[Item]:
-        for seed in map(int, path.read_text().split()):
-            whole = straight_road(3, seed=seed, dt=0.1, steps=91, segment_id=f"s{seed}")
+        for whole in super()._read(path):
             pieces = [piece for k in range(len(whole.road.lanes)) for piece in _halves(whole.road.lanes[k])]
             yield whole.replace(road=make_road(pieces))
 
@@ -115,8 +113,8 @@ def _halves(points: NDArray[Any]) -> list[NDArray[Any]]:
 
 
 def test_conversion_joins_and_counts_them(tmp_path: Path) -> None:
-    (tmp_path / "a.cut").write_text("1 2")
-    (tmp_path / "b.cut").write_text("3")
+    (tmp_path / "a.scene").write_text("straight 1\nstraight 2")
+    (tmp_path / "b.scene").write_text("straight 3")
     report = convert(Cut(), [tmp_path], tmp_path / "out", workers=2)
     store = SegmentStore(tmp_path / "out")
     each = len(store[0].road.lanes) // 2
@@ -127,7 +125,7 @@ def test_conversion_joins_and_counts_them(tmp_path: Path) -> None:
     old = json.loads((tmp_path / "out" / "report.json").read_text())
     del old["joined_gaps"]
     assert Report.from_json(old).joined_gaps == 0
-    (tmp_path / "c.cut").write_text("4")
-    convert(Cut(), [tmp_path / "c.cut"], tmp_path / "more", workers=2)
+    (tmp_path / "c.scene").write_text("straight 4")
+    convert(Cut(), [tmp_path / "c.scene"], tmp_path / "more", workers=2)
     merge([tmp_path / "out", tmp_path / "more"], tmp_path / "both")
     assert info(tmp_path / "both")["joined_gaps"] == 4 * each

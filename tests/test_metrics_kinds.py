@@ -250,6 +250,8 @@ def test_collisions_agree_with_shapely(seed):
         area = max(shapely.area(shapely.intersection(shapes[b, me, t], shapes[b, others, t])), default=0)
         if not 0 < area < 1e-9:
             assert found[b, n, t] == (bool(valid[b, me, t]) and area > 0)
+    # Between states nothing is lost that states show.
+    assert (collisions(position, heading, size, valid, subject) | ~found[..., 1:]).all()
 
 
 def test_collisions_by_hand():

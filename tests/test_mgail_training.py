@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers_runs import build, pieces, same_weights, stopped, tiny, weights
+from helpers_runs import build, pieces, same_weights, stopped, tiny, trained_as, weights
 from helpers_segments import crossing, hide, straight_road
-from helpers_store import fill
+from helpers_store import stored
 from symphony import keys
 from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig, MGAILConfig, TrainConfig
+from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs import Displacement
 from symphony.errors import SymphonyError
@@ -33,7 +33,6 @@ SHORT = MGAILConfig(regression=2, head_start=2, rollouts=3)
 STILL = MGAILConfig(regression=0, head_start=9, rollouts=3)
 """Keeps a policy as it is."""
 SETTINGS = EvaluateConfig(rollouts=2)
-Trained = Callable[..., Path]
 
 
 def config(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
@@ -41,35 +40,14 @@ def config(method: Any, store: Path, out: Path, **changes: Any) -> TrainConfig:
     return replace(tiny(method, store, out, steps=6, mgail=SHORT), **changes)
 
 
-def written(path: Path, *steps: int) -> Path:
-    """Write a store of segments of some steps; one vehicle comes into sight after the start."""
-    late = hide(crossing(5, seed=1, steps=steps[2]), 3, slice(0, 2))
-    fill(path, [straight_road(4, seed=0, steps=steps[0]), crossing(4, seed=0, steps=steps[1]), late])
-    return path
+def made(steps: int, last: int) -> list[RunSegment]:
+    """Segments of some steps; in the last one, a vehicle comes into sight after the start."""
+    late = hide(crossing(5, seed=1, steps=last), 3, slice(0, 2))
+    return [straight_road(4, seed=0, steps=steps), crossing(4, seed=0, steps=steps), late]
 
 
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return written(tmp_path_factory.mktemp("data") / "store", 4, 4, 5)
-
-
-@pytest.fixture(scope="module")
-def seconds(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The segments last 2, 2 and 2.4 s."""
-    return written(tmp_path_factory.mktemp("seconds") / "store", 11, 11, 13)
-
-
-@pytest.fixture(scope="module")
-def trained(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    """Runs made once each; never written to again."""
-    runs: dict[str, Path] = {}
-
-    def get(method: str) -> Path:
-        if method not in runs:
-            runs[method] = train(config(method, store, tmp_path_factory.mktemp("runs") / method))
-        return runs[method]
-
-    return get
+store, seconds = stored(lambda: made(4, 5)), stored(lambda: made(11, 13))
+trained = trained_as(config)
 
 
 def copies(trainer: Trainer) -> dict[str, list[Tensor]]:

@@ -116,17 +116,13 @@ def make(pace=2.0, slope=0.1, loc=(0.0, 0.0), scale=(1.0, 1.0), dtype=torch.floa
     return BoundedDisplacement(*parts, REACH)
 
 
-def given_bounds(law):
-    paces, slopes, inner = st.floats(0, 8), st.floats(0.005, 0.3), st.floats(-0.99 * INNER, 0.99 * INNER)
-    return settings(max_examples=25)(given(paces, slopes, inner, inner)(law))
-
-
 def policy(seed=0, **kwargs):
     torch.manual_seed(seed)
     return displacement_policy(SELF_FEATURES, GROUPS, **{"dt": 0.2, "hidden": 16, "head": (16,), **kwargs})
 
 
-@given_bounds
+@settings(max_examples=25)
+@given(st.floats(0, 8), st.floats(0.005, 0.3), *[st.floats(-0.99 * INNER, 0.99 * INNER)] * 2)
 def test_latent_numbers_come_back(pace, slope, first, second):
     dist, u = make(pace, slope), double([first, second])[0]
     torch.testing.assert_close(dist.latent(dist.displacement(u)), u, rtol=1e-6, atol=1e-6)

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.nn import functional
 
+import helpers_objectives as objectives
 from helpers_objectives import OBSERVATION, VALID, check_contract
 from symphony.objectives import DiscriminatorLoss, auc
 
@@ -24,13 +25,8 @@ def discriminator(*layers):
     return TensorDictModule(net, in_keys=[OBSERVATION], out_keys=[SCORE])
 
 
-def batch(*shape, agents=3):
-    torch.manual_seed(1)
-    td = TensorDict(batch_size=shape)
-    td[OBSERVATION] = torch.randn(*shape, agents, 4)
-    td[SIMULATED] = (torch.rand(*shape, 1) < 0.8).expand(*shape, agents).clone()
-    td[VALID] = torch.rand(*shape, agents) < 0.7
-    return td
+def batch(*shape):
+    return objectives.batch(*shape).rename_key_(objectives.ROLLOUT, SIMULATED)
 
 
 def fixed(score, simulated, **arguments):

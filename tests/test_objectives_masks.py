@@ -9,12 +9,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from helpers_losses import batch_of, losses, spec
+from helpers_losses import batch_of, losses, world
 from helpers_objectives import learned
 from helpers_segments import crossing, straight_road
 from helpers_store import fill
 from symphony import keys
-from symphony.agents import build_agent
 from symphony.data.store import SegmentStore
 from symphony.envs import DrivingEnv, collate, scene
 from symphony.learning.demonstrations import SceneDataset
@@ -28,12 +27,10 @@ SPACES = pytest.mark.parametrize("space", ["bicycle", "displacement"])
 
 def parts(space: str) -> tuple[Any, DrivingEnv, dict[str, Any]]:
     """An agent, the environment it learns in, and the losses of its networks."""
-    torch.manual_seed(0)
-    agent = build_agent("agent", spec(space))
     # One scene with three interactive agents and one with two, hence with one that is padding.
     numbers = ([0, 1, 2], [0, 1])
     scenes = collate([scene(s, n, LaneGraph(s.road)) for s, n in zip(SEGMENTS, numbers, strict=True)])
-    env = DrivingEnv(scenes, agent.dynamics, agent.observation)
+    agent, env = world(space, scenes=scenes)
     found = losses(agent, env)
     return agent, env, {name: loss for name, loss in found.items() if name != "mgail" or space != "bicycle"}
 

@@ -7,30 +7,21 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import shapely
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from helpers_convert import FakeReader
 from helpers_segments import hide, random_segment, straight_road
 from symphony.data.convert import convert, info, merge
 from symphony.data.overlaps import overlapping
 from symphony.data.report import Report
 from symphony.data.segment import AgentType, RunSegment
 from symphony.data.selection import travel
-from symphony.data.sources.base import Item, Reader
+from symphony.data.sources.base import Item
 from symphony.data.store import SegmentStore
 from symphony.geometry import LEVEL
-
-
-def boxes(s: RunSegment, step: int) -> list[shapely.Polygon]:
-    found = []
-    for a in range(s.num_agents):
-        length, width = s.size[a, :2].astype(float) / 2
-        shape = shapely.box(-length, -width, length, width)
-        cos, sin = np.cos(float(s.heading[a, step])), np.sin(float(s.heading[a, step]))
-        turned = shapely.transform(shape, lambda p, c=cos, n=sin: p @ np.array([[c, n], [-n, c]]))
-        found.append(shapely.transform(turned, lambda p, a=a: p + s.position[a, step, :2].astype(float)))
-    return found
+from test_geometry import polygons
 
 
 def crowded(seed: int) -> RunSegment:
@@ -48,7 +39,8 @@ def test_agrees_with_shapely(seed: int) -> None:
     sure, possible = set(), set()
     for step in range(segment.num_steps):
         there = np.flatnonzero(segment.valid[:, step])
-        shapes = boxes(segment, step)
+        now = segment.position[:, step, :2], segment.heading[:, step], segment.size[:, :2]
+        shapes = polygons(*map(torch.from_numpy, now))
         for i, a in enumerate(there.tolist()):
             for b in there[i + 1 :].tolist():
                 bottom = segment.position[[a, b], step, 2] - segment.size[[a, b], 2] / 2
@@ -82,23 +74,17 @@ def test_who_counts() -> None:
     assert overlapping(segment.replace(agent_type=types)).tolist() == [[0, 2]]
 
 
-class Mixed(Reader):
-    """Each line of a file is the seed of a clean segment or, after an ``x``, of one with an overlap."""
-
-    name = "mixed"
-    patterns = ("*.mixed",)
+class Mixed(FakeReader):
+    """Its crossings are segments with an overlap."""
 
     def _read(self, path: Path) -> Iterator[Item]:
-        for line in path.read_text().split():
-            seed = int(line.removeprefix("x"))
-            clean = straight_road(4, seed=seed, dt=0.1, steps=91, segment_id=f"good-{seed}")
-            found = overlapped(seed) if line.startswith("x") else clean
-            yield found.replace(source=self.name, file=path.name)
+        for item in super()._read(path):
+            yield overlapped(int(item.segment_id[9:])) if item.segment_id.startswith("crossing") else item
 
 
 def test_a_conversion_counts_and_tells(tmp_path: Path) -> None:
-    for k, text in enumerate(("x1 2 3", "4 x5")):
-        (tmp_path / f"{k}.mixed").write_text(text)
+    for k, text in enumerate(("crossing 1\nstraight 2\nstraight 3", "straight 4\ncrossing 5")):
+        (tmp_path / f"{k}.scene").write_text(text)
     report = convert(Mixed(), [tmp_path], tmp_path / "all", workers=2)
     assert (report.converted, report.overlaps) == (5, 2)
     assert "of 2 of 5 segments (40.0 %)" in report.warning
@@ -106,8 +92,8 @@ def test_a_conversion_counts_and_tells(tmp_path: Path) -> None:
     tagged = {store.ids[i] for i in range(5) if store.tags(i).get("overlaps")}
     assert (tagged, info(tmp_path / "all")["overlaps"]) == ({"bad-1", "bad-5"}, 2)
     assert Report.from_json(json.loads(json.dumps(report.to_json()))) == report
-    (tmp_path / "more.mixed").write_text("6 x7")
-    convert(Mixed(), [tmp_path / "more.mixed"], tmp_path / "more", workers=2)
+    (tmp_path / "more.scene").write_text("straight 6\ncrossing 7")
+    convert(Mixed(), [tmp_path / "more.scene"], tmp_path / "more", workers=2)
     merge([tmp_path / "all", tmp_path / "more"], tmp_path / "both")
     assert info(tmp_path / "both")["overlaps"] == 3
 

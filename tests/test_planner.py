@@ -1,6 +1,4 @@
-"""A planner as the ego: what it observes, that it is forked with its branches, and that its failures are counted. The
-included ones by hand-made scenes: whom IDM follows, where it stops, and that the log is played back.
-"""
+"""A planner as the ego: what it observes, how it is forked and fails; the included ones in hand-made scenes."""
 
 from __future__ import annotations
 
@@ -19,7 +17,7 @@ from shapely import LineString, Point
 
 from helpers_agents import small
 from helpers_segments import CAR, LANE_WIDTH, crossing, hide, make_road, make_segment, ring, straight_road
-from helpers_store import fill
+from helpers_store import fill, stored
 from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig
@@ -38,8 +36,8 @@ from symphony.planners.interface import Control, Pose, Scenario, Traffic, planne
 from symphony.planners.view import FunctionPlanner, Observation
 from symphony.roadgraph import LaneGraph
 from symphony.rollouts.driving import Simulation, beside_planner, simulation, spread_runs
-from symphony.saved.folder import RolloutFolder, load_rollouts
-from symphony.saved.saving import save_simulation
+from symphony.saved.folder import load_rollouts
+from test_planner_kinds import run
 
 AGENT = "pretrained:bc_ts_h"
 
@@ -92,9 +90,7 @@ SEARCHES = [{"search": "none"}, TREE, {"search": "tree", "branches": 6, "rule": 
 
 
 class Foreseeing(Wanderer):
-    """Gives back a trajectory, the first state of which it drives, the last of which tells its branch by what all
-    agents did; at times the next state alone.
-    """
+    """Gives back a trajectory whose end tells its branch by what all agents did; at times the next state alone."""
 
     def plan(self, traffic: Traffic) -> Any:
         pose = super().plan(traffic)
@@ -230,45 +226,39 @@ def test_failures_are_those_of_their_own_rollouts_in_a_search() -> None:
     assert sorted(found.failed[0]) == [k for k, slot in enumerate(first) if slot % 2 == 0]
 
 
+CALLS: list[tuple[str, int]] = []
+
+
+def noted(seen: Observation) -> tuple[float, float]:
+    CALLS.append((seen.segment_id, seen.step))
+    return 0.0, 0.0
+
+
 def test_nobody_plans_beyond_the_end_of_a_segment_beside_a_longer_one(tmp_path: Path) -> None:
-    asked: dict[str, list[int]] = {}
-
-    def noted(seen: Observation) -> tuple[float, float]:
-        asked.setdefault(seen.segment_id, []).append(seen.step)
-        return 0.0, 0.0
-
+    CALLS.clear()
     segments = [crossing(4, steps=4), straight_road(4, steps=7)]
-    fill(tmp_path / "store", segments)
-    data = SceneDataset(SegmentStore(tmp_path / "store"), 2, small().dynamics, routes=True)
+    data = SceneDataset(fill(tmp_path / "store", segments), 2, small().dynamics, routes=True)
     egos = EgoPlanners("mine", partial(FunctionPlanner, noted), segments)
     config = EvaluateConfig(rollouts=1, search="none")
     assert simulation(small(), data.scenes(range(2)), config, egos=[egos]).failed == ({}, {})
-    assert asked == {s.segment_id: list(range(s.num_steps - 1)) for s in segments}
+    assert sorted(CALLS) == [(s.segment_id, step) for s in segments for step in range(s.num_steps - 1)]
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Path:
-    late = hide(straight_road(3, seed=5, steps=11), 0, slice(0, 2))
-    fill(tmp_path / "store", [crossing(4, steps=11), late, straight_road(4, steps=11)])
-    return tmp_path / "store"
-
-
-def run(store: Path, out: Path, planner: str, batch: int = 2, **settings: Any) -> RolloutFolder:
-    data = SceneDataset(SegmentStore(store), 2, small().dynamics, routes=True, duration=2)
-    config = EvaluateConfig(rollouts=2, branches=4, batch=batch, **settings)
-    return save_simulation(out, small(), data, config, planner=planner)
+LATE = hide(straight_road(3, seed=5, steps=11), 0, slice(0, 2))
+store = stored(lambda: [crossing(4, steps=11), LATE, straight_road(4, steps=11)])
 
 
 def test_the_same_seed_gives_the_same_bytes_in_any_batch(store: Path, tmp_path: Path) -> None:
-    one, other = (run(store, tmp_path / str(batch), f"{__name__}:Wanderer", batch) for batch in (1, 3))
+    how: dict[str, Any] = {"planner": f"{__name__}:Wanderer", "search": "tree", "branches": 4}
+    one, other = (run(store, tmp_path / str(batch), batch=batch, **how) for batch in (1, 3))
     digests = [{e.segment: e.sha256 for e in folder.entries} for folder in (one, other)]
     assert (digests[0], len(digests[0])) == (digests[1], 2)
-    third = run(store, tmp_path / "seed", f"{__name__}:Wanderer", seed=1)
+    third = run(store, tmp_path / "seed", seed=1, **how)
     assert {e.segment: e.sha256 for e in third.entries} != digests[0]
 
 
 def test_a_segment_without_its_ego_is_on_record(store: Path, tmp_path: Path) -> None:
-    folder = run(store, tmp_path / "sim", "log", search="none")
+    folder = run(store, tmp_path / "sim", "log")
     assert [(entry.segment, entry.rollouts) for entry in folder.failures] == [("straight-5", 2)]
     assert "ego" in str(folder.failures[0].failed)
     assert folder.about.drivers == {"ego": "log", "interactive": "tiny", "others": "playback"}
@@ -277,7 +267,7 @@ def test_a_segment_without_its_ego_is_on_record(store: Path, tmp_path: Path) -> 
         assert saved.drivers == ("log", "tiny")
         assert saved.goal[0, 0] >= 0
     with pytest.raises(DataError, match="another simulation"):
-        run(store, tmp_path / "sim", "idm", search="none")
+        run(store, tmp_path / "sim", "idm")
 
 
 def test_the_command_simulates_reports_and_shows(store, tmp_path, monkeypatch, capsys):
@@ -353,21 +343,13 @@ def test_beside_a_planner_nothing_is_searched_unless_asked_for() -> None:
         assert beside_planner(found) == found
 
 
-CALLS: list[str] = []
-
-
-def noted(seen: Observation) -> tuple[float, float]:
-    CALLS.append(seen.segment_id)
-    return 0.0, 0.0
-
-
 def test_a_planner_is_asked_in_no_more_trees_than_the_runs_are_leaves_of(tmp_path: Path) -> None:
     fill(tmp_path / "store", [straight_road(4, steps=3, segment_id=f"road-{i}") for i in range(5)])
     words = f"simulate {AGENT} --search tree --planner {__name__}:noted --data {tmp_path}/store --runs".split()
     for runs, segments in ((4, 1), (16, 4), (64, 4)):
         CALLS.clear()
         assert main([*words, str(runs), "--out", str(tmp_path / str(runs))]) == 0
-        assert (len(CALLS), len(set(CALLS))) == (2 * runs, segments)  # one of each step of each run
+        assert (len(CALLS), len(dict(CALLS))) == (2 * runs, segments)  # one of each step of each run
         assert sum(entry.rollouts for entry in load_rollouts(tmp_path / str(runs)).entries) == runs
 
 

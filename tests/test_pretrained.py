@@ -13,7 +13,7 @@ import torch
 
 from helpers_runs import same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
-from helpers_store import fill
+from helpers_store import contents, stored
 from symphony.agents import choice as pretrained
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import checkpoints, parts_of
@@ -37,12 +37,7 @@ def load_script(name):
 
 
 make_pretrained = load_script("make_pretrained")
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("data") / "town" / "train"
-    return fill(path, [straight_road(4, steps=5), crossing(4, seed=1, steps=5)]).path
+store = stored(lambda: [straight_road(4, steps=5), crossing(4, seed=1, steps=5)], "town/train")
 
 
 @pytest.fixture(scope="module")
@@ -63,10 +58,6 @@ def made(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An agent `tiny` made from the run, in place of those that come with the package."""
     monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "pretrained")
     return make_pretrained.make(str(run), "tiny", pruning=PRUNING, folder=tmp_path / "pretrained")
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_an_agent_is_its_run_without_what_only_training_needs(run, made, tmp_path):

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from helpers_roadgraph import arc, crossing, drive, fork, make_road, roundabout
+from helpers_roadgraph import arc, crossing, drive, fork, graph_of, make_road, roundabout
+from helpers_segments import along
 from symphony.errors import DataError
 from symphony.geometry.polylines import NEAR, earliest_pass, stations_along
 from symphony.roadgraph import LaneGraph, lane_of, starting_lanes, visited_regions
@@ -111,8 +112,7 @@ def test_assignment_agrees_with_shapely(seed):
 
 
 def test_starting_lanes_around_a_junction():
-    road, name = crossing()
-    graph = LaneGraph(road)
+    graph, name = graph_of(crossing())
     assert starting_lanes(graph, [2, -30], np.pi / 2) == [(name["in0"], pytest.approx(40))]
     # Just before the junction the connectors are near, but the vehicle is alongside the approach.
     assert [k for k, _ in starting_lanes(graph, [2, -10.5], np.pi / 2)] == [name["in0"]]
@@ -134,8 +134,7 @@ def movement(graph, name, kind, k, **options):
 
 
 def test_invalid_states_are_bridged_and_never_read():
-    road, name = crossing()
-    graph = LaneGraph(road)
+    graph, name = graph_of(crossing())
     position, heading = movement(graph, name, "left", 0, step=0.5)
     valid = np.ones(len(position), bool)
     valid[114:124] = False
@@ -146,8 +145,7 @@ def test_invalid_states_are_bridged_and_never_read():
 
 
 def test_trajectories_that_share_a_history_or_stand_equal_each_alone():
-    road, name = crossing()
-    graph = LaneGraph(road)
+    graph, name = graph_of(crossing())
     rng, paths = np.random.default_rng(0), []
     for kind, k in (("left", 0), ("right", 1), ("ahead", 2), ("left", 3)):
         path = movement(graph, name, kind, k, step=1.5, offset=rng.normal(0, 0.3))
@@ -216,8 +214,7 @@ def brute_force(graph, position, heading, valid):
 
 @pytest.mark.parametrize("make", [crossing, roundabout])
 def test_agrees_with_the_definition(make):
-    road, _ = make()
-    graph = LaneGraph(road)
+    graph, _ = graph_of(make())
     rng = np.random.default_rng(5)
     hits = 0
     for _ in range(10):
@@ -246,11 +243,6 @@ def bend(turns: float, radius: float = 20.0, length: float = 189.0) -> Reals:
     return radius * np.stack([np.sin(arc / radius), 1.0 - np.cos(arc / radius)], -1)
 
 
-def at(line: Reals, along: Reals) -> Reals:
-    arc = np.concatenate([[0.0], np.linalg.norm(np.diff(line, axis=0), axis=-1).cumsum()])
-    return np.stack([np.interp(along, arc, line[:, k]) for k in (0, 1)], -1)
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.floats(12.0, 60.0), st.floats(0.0, 20.0), st.floats(0.0, 5.0), st.integers(0, 999), st.booleans())
 def test_who_drives_around_a_block_gets_on(radius, speed, start, seed, hidden):
@@ -259,7 +251,7 @@ def test_who_drives_around_a_block_gets_on(radius, speed, start, seed, hidden):
     arc = np.linalg.norm(np.diff(line, axis=0), axis=-1).sum()
     true = np.minimum(start + speed * 0.2 * np.arange(51), arc)
     rng = np.random.default_rng(seed)
-    path = at(line, true) + rng.uniform(-0.3, 0.3, (51, 2))
+    path = along(line, true)[0] + rng.uniform(-0.3, 0.3, (51, 2))
     valid = np.ones(51, bool)
     if hidden:
         valid[[0, 7, 8, 30]] = False
@@ -274,8 +266,8 @@ def test_who_drives_around_a_block_gets_on(radius, speed, start, seed, hidden):
 def test_on_lines_that_never_come_back_it_is_the_nearest_place(seed: int, steps: int) -> None:
     rng = np.random.default_rng(seed)
     line = np.stack([np.arange(0.0, 190.0, 3.0), 6.0 * np.sin(np.arange(64) / rng.uniform(8, 20))], -1)
-    along = np.sort(rng.uniform(-10.0, 200.0, steps))
-    path = np.stack([along, rng.uniform(-3.0, 3.0, steps) + np.interp(along, *line.T)], -1)
+    x = np.sort(rng.uniform(-10.0, 200.0, steps))
+    path = np.stack([x, rng.uniform(-3.0, 3.0, steps) + np.interp(x, *line.T)], -1)
     found = stations_along(line[None], path[None], np.ones((1, steps), bool))[0]
     nearest = shapely.line_locate_point(shapely.LineString(line), shapely.points(path))
     np.testing.assert_allclose(found, nearest, atol=1e-6)
@@ -284,7 +276,7 @@ def test_on_lines_that_never_come_back_it_is_the_nearest_place(seed: int, steps:
 @pytest.mark.parametrize("turn", [0.3, 2.0])
 def test_turning_the_world_padding_and_company_change_nothing(turn: float) -> None:
     line, straight = bend(1.0), bend(0.0)
-    path, other = at(line, np.arange(0.0, 160.0, 4.0)), at(straight, np.arange(0.0, 160.0, 4.0)) + 1.0
+    path, other = (along(each, np.arange(0.0, 160.0, 4.0))[0] for each in (line, straight))
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     valid = np.ones((1, len(path)), bool)
     alone = stations_along(line[None], path[None], valid)
@@ -292,7 +284,7 @@ def test_turning_the_world_padding_and_company_change_nothing(turn: float) -> No
     np.testing.assert_allclose(turned, alone, atol=1e-9)
     padded = np.pad(line, ((0, 9), (0, 0)), "edge")
     np.testing.assert_allclose(stations_along(padded[None], path[None], valid), alone, atol=1e-12)
-    both = stations_along(np.stack([line, straight]), np.stack([path, other]), valid.repeat(2, 0))
+    both = stations_along(np.stack([line, straight]), np.stack([path, other + 1.0]), valid.repeat(2, 0))
     np.testing.assert_array_equal(both[:1], alone)
 
 

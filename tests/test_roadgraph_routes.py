@@ -12,7 +12,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers_roadgraph import crossing, drive, merge, moved_road, parallel, pocket, roundabout, tree, turned
+from helpers_roadgraph import crossing, drive, graph_of, merge, moved_road, parallel, pocket, roundabout, tree, turned
 from helpers_segments import make_road
 from symphony.roadgraph import LaneGraph, Route, blend, route_line, route_lines, routes
 from symphony.roadgraph import ground_truth_routes as ground_truth
@@ -41,8 +41,7 @@ def ground_truth_routes(graph, found, log, valid):
 
 
 def test_crossing_has_three_routes_from_each_arm():
-    road, name = crossing()
-    graph = LaneGraph(road)
+    graph, name = graph_of(crossing())
     for k in range(4):
         found = routes(graph, [(name[f"in{k}"], 10.0)])
         ways = enumerate(("right", "ahead", "left"), start=1)
@@ -51,8 +50,7 @@ def test_crossing_has_three_routes_from_each_arm():
 
 
 def test_roundabout_ends_by_the_horizon():
-    road, name = roundabout()
-    graph = LaneGraph(road)
+    graph, name = graph_of(roundabout())
     found = lanes_of(routes(graph, [(name["entry0"], 0.0)], horizon=200))
     assert len(set(found)) == len(found) > 4
     for route in found:
@@ -65,8 +63,7 @@ def test_roundabout_ends_by_the_horizon():
 
 
 def test_limit_keeps_every_near_branch():
-    road, name = tree(8)
-    graph = LaneGraph(road)
+    graph, name = graph_of(tree(8))
     everything = lanes_of(routes(graph, [(name["r"], 0.0)], limit=1000))
     assert len(everything) == 256
     found = lanes_of(routes(graph, [(name["r"], 0.0)], limit=100))
@@ -87,8 +84,7 @@ def test_routes_do_not_depend_on_the_order_of_connections():
 
 
 def test_pocket_is_reached_by_a_change_where_it_begins():
-    road, name = pocket()
-    graph = LaneGraph(road)
+    graph, name = graph_of(pocket())
     plain = Route((name["first"], name["second"], name["third"], name["on"]))
     turn = Route((name["first"], name["second"], name["third"], name["pocket"], name["turn"]), 3, 0.0, 0.0)
     assert routes(graph, [(name["first"], 0.0)]) == [plain, turn]
@@ -101,8 +97,7 @@ def test_pocket_is_reached_by_a_change_where_it_begins():
 
 
 def test_parallel_lanes_offer_one_change_not_one_per_piece():
-    road, name = parallel()
-    graph = LaneGraph(road)
+    graph, name = graph_of(parallel())
     for own, other in ("ab", "ba"):
         found = routes(graph, [(name[f"{own}0"], 5.0)])
         mine, others = ([name[f"{side}{k}"] for k in range(3)] for side in (own, other))
@@ -145,8 +140,7 @@ def test_ground_truth_is_the_route_that_was_driven(movement, degrees):
 
 
 def test_ground_truth_ties_and_empty_logs():
-    road, name = crossing()
-    graph = LaneGraph(road)
+    graph, name = graph_of(crossing())
     found = routes(graph, [(name["in0"], 0.0)])
     log = np.stack((np.full(5, 2.0), np.linspace(-60, -50, 5)), -1)
     assert len(found) > 1
@@ -157,8 +151,7 @@ def test_ground_truth_ties_and_empty_logs():
 
 
 def test_route_errors_agree_with_shapely():
-    road, name = crossing()
-    graph = LaneGraph(road)
+    graph, name = graph_of(crossing())
     lines = lines_of(graph, routes(graph, [(name["in1"], 0.0)]))
     log = np.random.default_rng(1).uniform(-40, 40, (20, 2))
     expected = [shapely.distance(shapely.LineString(line), shapely.points(log)).mean() for line in lines]

@@ -19,7 +19,7 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 
 from helpers_agents import make_agent
 from helpers_segments import crossing, make_road, make_segment, straight_road
-from helpers_store import fill
+from helpers_store import stored
 from symphony import SegmentStore, builtin_store, keys, load_agent
 from symphony.collectors import Backtrack, KeepBest, with_rows
 from symphony.config import EvaluateConfig, SearchConfig
@@ -43,9 +43,7 @@ SEGMENTS += [crossing(4, seed=2, steps=6), straight_road(3, seed=3, steps=5)]
 DECISIONS = 7
 
 
-@pytest.fixture(scope="module")
-def store(tmp_path_factory):
-    return fill(tmp_path_factory.mktemp("data") / "store", [*SEGMENTS, blocked()])
+store = stored(lambda: [*SEGMENTS, blocked()], opened=True)
 
 
 @pytest.fixture(scope="module")

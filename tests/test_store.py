@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from helpers_processes import apart
 from helpers_segments import crossing, segments, straight_road
-from helpers_store import files, fill, hashes, unlike
+from helpers_store import files, fill, hashes, rehash, stored, unlike
 from symphony.cli import main
 from symphony.data import store_writer
 from symphony.data.segment import RunSegment, content_hash
@@ -255,10 +255,7 @@ def test_processes_read_while_a_writer_appends(folder: Path) -> None:
         assert reader.exitcode == 0
 
 
-@pytest.fixture
-def filled(tmp_path: Path) -> Path:
-    fill(tmp_path / "store", [crossing(seed=1), straight_road(seed=2), crossing(seed=3)])
-    return tmp_path / "store"
+filled = stored(lambda: [crossing(seed=1), straight_road(seed=2), crossing(seed=3)], scope="function")
 
 
 def change(path: Path, offset: int, data: bytes) -> None:
@@ -339,16 +336,6 @@ def test_every_changed_byte_is_noticed(tmp_path: Path) -> None:
             assert caught.value.file is not None, path
         path.write_bytes(good)
     SegmentStore(tmp_path / "store").verify()
-
-
-def rehash(filled: Path) -> None:
-    """Give what is in a store the hashes it has now, as who wants to deceive would."""
-    store = SegmentStore(filled)
-    index = SEGMENTS.index_path(filled)
-    records = np.fromfile(index, SEGMENTS.record)
-    for k in range(len(records)):
-        records[k]["hash"] = np.frombuffer(bytes.fromhex(content_hash(store._read(k))), np.uint8)
-    index.write_bytes(records.tobytes())
 
 
 @pytest.mark.parametrize(("column", "data", "field"), [

@@ -9,10 +9,10 @@ import pytest
 
 from helpers_runs import tiny
 from helpers_segments import crossing, straight_road
+from helpers_store import fill
 from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.resample import resample
-from symphony.data.store_writer import StoreWriter
 from symphony.envs import collate, scene
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
@@ -22,13 +22,8 @@ from symphony.recipes import train
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[float, Path]:
     """Make stores of the same two logs, by steps of 0.1 and of 0.2 seconds."""
-    found = {}
-    for dt in (0.1, 0.2):
-        found[dt] = tmp_path_factory.mktemp("data")
-        with StoreWriter(found[dt]) as writer:
-            for log in (straight_road(4, steps=61, dt=0.1), crossing(4, steps=61, dt=0.1)):
-                writer.append(resample(log, dt))
-    return found
+    logs, folder = [make(4, steps=61, dt=0.1) for make in (straight_road, crossing)], tmp_path_factory.mktemp("data")
+    return {dt: fill(folder / str(dt), [resample(log, dt) for log in logs]).path for dt in (0.1, 0.2)}
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +65,6 @@ def test_stores_and_batches_of_several_rates_are_refused(tmp_path: Path) -> None
     slow, fast = straight_road(3, dt=0.2, seed=1), straight_road(3, dt=0.1, seed=2)
     with pytest.raises(DataError, match=r"different time steps in one batch: 0\.1 s, 0\.2 s"):
         collate([scene(slow), scene(fast)])
-    with StoreWriter(tmp_path / "mixed") as writer:
-        writer.append(slow)
-        writer.append(fast)
+    fill(tmp_path / "mixed", [slow, fast])
     with pytest.raises(DataError, match=rf"{fast.segment_id}.*has steps of 0\.1 s, others of 0\.2 s"):
         train(tiny("bc", tmp_path / "mixed", tmp_path / "run"))

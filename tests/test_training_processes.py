@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,9 @@ import helpers_distributed
 import helpers_killed
 from helpers_distributed import LOSSES, TRAINED
 from helpers_processes import output_of
-from helpers_runs import build, pieces, same_weights, tiny, weights
+from helpers_runs import build, pieces, run_of, same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
-from helpers_store import fill
+from helpers_store import fill, stored
 from symphony import keys
 from symphony.agents.checkpoint import CheckpointError, checkpoints, latest, load_checkpoint
 from symphony.agents.choice import choose
@@ -30,17 +31,8 @@ from symphony.training import trainer as training
 from symphony.training.logging import Tracker, read_metrics
 from symphony.training.processes import Processes, processes
 
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found = [straight_road(4, steps=10), crossing(4, steps=9)]
-    return fill(tmp_path_factory.mktemp("data") / "store", found).path
-
-
-@pytest.fixture(scope="module")
-def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Never written to."""
-    return train(tiny("bc", store, tmp_path_factory.mktemp("runs") / "run"))
+store = stored(lambda: [straight_road(4, steps=10), crossing(4, steps=9)])
+run = run_of(partial(tiny, "bc"))
 
 
 def learned(run: Path) -> dict[str, bytes]:
@@ -218,8 +210,8 @@ Found = tuple[Path, list[dict[str, Any]]]
 def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     """The folder of what the two have written, and what each reports."""
     base = tmp_path_factory.mktemp("distributed")
-    made = [(straight_road(4, seed=seed, steps=9), crossing(4, seed=seed, steps=8)) for seed in range(2)]
-    fill(base / "store", [segment for both in made for segment in both])
+    kinds = (straight_road, 9), (crossing, 8)
+    fill(base / "store", [make(4, seed=seed, steps=steps) for seed in range(2) for make, steps in kinds])
     output_of(helpers_distributed.both, base / "store", base, said=base / "said.txt", limit=500)
     return base, [json.loads((base / f"rank{rank}.json").read_text()) for rank in range(2)]
 

@@ -9,7 +9,6 @@ import os
 import shutil
 import sys
 import tarfile
-import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from helpers_sources import little_memory
 from symphony.agents import load_agent
 from symphony.agents.choice import pretrained_folder
 from symphony.cli import main
@@ -170,10 +170,5 @@ BOMBS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str]]
 def test_sizes_come_before_memory(kind: str, tmp_path: Path) -> None:
     make, read, why = BOMBS[kind]
     make(path := tmp_path / "bomb")
-    tracemalloc.start()
-    try:
-        with pytest.raises(DataError, match=why):
-            read(path)
-        assert tracemalloc.get_traced_memory()[1] < 32 * MIB
-    finally:
-        tracemalloc.stop()
+    with little_memory(32 * MIB), pytest.raises(DataError, match=why):
+        read(path)

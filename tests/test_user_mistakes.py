@@ -15,9 +15,9 @@ import pytest
 import torch
 
 from helpers_losses import spec
-from helpers_runs import tiny
+from helpers_runs import run_of, tiny
 from helpers_segments import crossing
-from helpers_store import fill
+from helpers_store import stored
 from symphony.agents import load_agent
 from symphony.agents.agent import build_agent
 from symphony.cli import ALL_FAILED, main
@@ -25,23 +25,13 @@ from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError
 from symphony.planners.identity import source_of
-from symphony.recipes import train
 from symphony.rollouts.crowd import crowd_dataset
 from symphony.saved.folder import load_rollouts
 from symphony.saved.saving import save_simulation
 
 PLAN = "def plan(seen):\n    return {}\n"
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("data") / "store"
-    return fill(path, [crossing(5, seed=seed, steps=6) for seed in range(3)]).path
-
-
-@pytest.fixture(scope="module")
-def run(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(tiny("bc_ts_h", store, tmp_path_factory.mktemp("runs") / "run", steps=2))
+store = stored(lambda: [crossing(5, seed=seed, steps=6) for seed in range(3)])
+run = run_of(partial(tiny, "bc_ts_h", steps=2))
 
 
 @pytest.fixture

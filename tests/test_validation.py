@@ -16,7 +16,7 @@ from torch import nn
 
 from helpers_runs import build, same_weights, tiny, weights
 from helpers_segments import crossing, straight_road
-from helpers_store import fill
+from helpers_store import fill, stored
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import CheckpointError, checkpoints, save_checkpoint
 from symphony.agents.choice import Best, choose, split_name
@@ -27,17 +27,8 @@ from symphony.recipes import train
 from symphony.training.hooks import METRICS, Validator
 from symphony.training.logging import read_metrics
 
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found = [straight_road(4, steps=6), crossing(4, steps=5)]
-    return fill(tmp_path_factory.mktemp("data") / "train", found).path
-
-
-@pytest.fixture(scope="module")
-def held_out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found = [crossing(6, seed=10 + seed, steps=5) for seed in range(4)]
-    return fill(tmp_path_factory.mktemp("data") / "held_out", found).path
+store = stored(lambda: [straight_road(4, steps=6), crossing(4, steps=5)])
+held_out = stored(lambda: [crossing(6, seed=10 + seed, steps=5) for seed in range(4)])
 
 
 def config(store: Path, out: Path, held_out: Path | None, method: Any = "bc", **changes: Any) -> TrainConfig:

@@ -17,7 +17,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from helpers_sources import write_records
-from helpers_wosac import record_rollouts, womd_record
+from helpers_wosac import META, record_rollouts, womd_record
 from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import WosacSettings
@@ -25,7 +25,6 @@ from symphony.errors import DataError, SymphonyError
 from symphony.wosac import check_submission, write_submission
 from symphony.wosac import wosac_pb2 as pb
 from symphony.wosac.files import read_rollouts, score_files
-from symphony.wosac.meta import SubmissionMeta
 from symphony.wosac.records import logged_scenario, read_scenarios, simulated_ids
 from symphony.wosac.scorer import CHALLENGES, score
 from symphony.wosac.scorer.scenario import STATES
@@ -241,8 +240,6 @@ def test_numbers_may_be_of_any_width_and_byte_order(tmp_path, kind):
 
 # --- submissions: written, and refused before a server would ---
 
-MADE = ("somebody@example.org", "made", False, False, False, "200K", True)
-META = SubmissionMeta(*MADE, authors=("A", "B"), affiliation="Nowhere")
 ROLLOUTS = {name: record_rollouts(womd_record(name), seed=seed) for seed, name in enumerate(NAMES)}
 AGENTS = {name: [100, 101, 102] for name in NAMES}
 

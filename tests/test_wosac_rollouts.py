@@ -314,10 +314,8 @@ def test_past_the_edge_of_the_map_vehicles_keep_their_velocity():
     np.testing.assert_array_equal(found.x[:, 2], constant_velocity(window).x[:, 2])
     x = found.x[:, :2] - window.origin[0]
     steps = np.diff(np.stack([x, found.y[:, :2]], -1), axis=2)
-    changes, gone = (
-        np.abs(np.diff(steps, axis=2)).max(-1),
-        x[..., :-2] > end + 4.0,
-    )  # A decision farther than the edge.
+    changes = np.abs(np.diff(steps, axis=2)).max(-1)
+    gone = x[..., :-2] > end + 4.0  # A decision farther than the edge.
     assert 0.3 < gone.mean() < 0.7
     assert 10 * changes[gone].max() < 1e-2 < changes[~gone].max()
     along = np.stack([np.cos(found.heading), np.sin(found.heading)], -1)[:, :2, :-2]
@@ -460,9 +458,8 @@ def test_the_record_has_the_score_and_tables_have_its_columns(tmp_path, capsys, 
         compare([entries[0], replace(entries[1], record=year)], "main")
     # The table of scores.
     for agents, drivers in ((whole, [*BASELINES, "random"]), ({RANDOM: whole[RANDOM]}, [])):
-        rows = [
-            line.split("|")[1:] for line in wosac_table(scores | {"agents": agents}).splitlines() if line[:2] == "| "
-        ]
+        lines = wosac_table(scores | {"agents": agents}).splitlines()
+        rows = [line.split("|")[1:] for line in lines if line[:2] == "| "]
         assert [row[0].strip() for row in rows] == ["", "---", *drivers, "random, no search"]
         for column, cell in zip(COLUMNS, rows[-1][1:], strict=False):
             value, error = column.scale * whole[RANDOM][column.key], 0.51 * 10**-column.digits

@@ -1,6 +1,4 @@
-"""The WOSAC score: laws, and numbers worked out by hand. What the official scorer finds is in
-``test_wosac_parity.py``.
-"""
+"""The WOSAC score: laws, and numbers by hand; what the official scorer finds is in ``test_wosac_parity.py``."""
 
 from __future__ import annotations
 

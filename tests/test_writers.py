@@ -13,6 +13,7 @@ import pytest
 from helpers_processes import apart
 from helpers_runs import tiny
 from helpers_saved import searched
+from helpers_store import contents
 from symphony.cli import main
 from symphony.data.builtin import builtin_store
 from symphony.errors import DataError
@@ -82,13 +83,12 @@ COMMANDS: dict[str, Callable[[str], list[str]]] = {
 def test_commands_that_write_refuse_a_second(lock, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     save_rollouts("sim", *searched())
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    before = contents(tmp_path)
     (tmp_path / lock).parent.mkdir(parents=True, exist_ok=True)
     with Lock(tmp_path / lock):
         assert main(COMMANDS[lock]("sim")) == 1
         assert f"is being written by another process: {os.getpid()} on " in capsys.readouterr().err
-    after = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    assert after == before
+    assert contents(tmp_path) == before
 
 
 def test_a_folder_that_learns_is_taken_over_by_nobody(tmp_path, monkeypatch):

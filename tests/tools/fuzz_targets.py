@@ -27,19 +27,19 @@ from helpers_saved import played, random_trees
 from helpers_scenarionet import write as scenarionet
 from helpers_segments import crossing, straight_road
 from helpers_sources import ROAD, commonroad, driver, obstacle, state, womd_scenario, write_records
-from helpers_wosac import record_rollouts, womd_record
+from helpers_store import rehash
+from helpers_wosac import META, record_rollouts, womd_record
 from symphony.agents.checkpoint import MANIFEST, checkpoints, load_checkpoint, save_checkpoint
 from symphony.agents.choice import Best
 from symphony.cli.rollouts import write_view
 from symphony.config import AgentSpec, DiscriminatorConfig, TrainConfig, read_json, to_json
 from symphony.data.convert import Preparation, info
-from symphony.data.segment import RunSegment, content_hash
+from symphony.data.segment import RunSegment
 from symphony.data.selection import choices
 from symphony.data.sources import get_reader, womd_pb2
 from symphony.data.sources.base import UnexpectedError
 from symphony.data.sources.womd import read_records
 from symphony.data.store import SegmentStore
-from symphony.data.store_format import SEGMENTS
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import report
@@ -47,7 +47,6 @@ from symphony.learning.demonstrations import SceneDataset
 from symphony.saved import folder as saved_folder
 from symphony.saved.folder import About, RolloutWriter, load_rollouts
 from symphony.wosac import wosac_pb2 as pb
-from symphony.wosac.meta import SubmissionMeta
 from symphony.wosac.submission import check_submission, required_agents, write_submission
 
 USED, REPORTED = 12, 4
@@ -249,11 +248,7 @@ def _read_store(folder: Path, file: str) -> tuple[str, str]:
     try:
         store = SegmentStore(place)
         if (folder / "rehash").exists():
-            records = np.fromfile(SEGMENTS.index_path(place), SEGMENTS.record, len(store))
-            for k in range(len(store)):
-                digest = bytes.fromhex(content_hash(store._read(k)))
-                records[k]["hash"] = np.frombuffer(digest, np.uint8)
-            SEGMENTS.index_path(place).write_bytes(records.tobytes())
+            rehash(place)
             store = SegmentStore(place)
         for segment in store:
             if wrong := absurd(segment):
@@ -336,14 +331,10 @@ def _read_configuration(folder: Path, _: str) -> tuple[str, str]:
 
 
 def _submission(folder: Path) -> Path:
-    facts: dict[str, Any] = {"account_name": "a@example.org", "unique_method_name": "made", "authors": ("A",)}
-    facts |= dict.fromkeys(("uses_lidar_data", "uses_camera_data", "uses_public_model_pretraining"), False)
-    facts |= {"num_model_parameters": "200K", "affiliation": "Nowhere"}
-    meta = SubmissionMeta(**facts, acknowledge_complies_with_closed_loop_requirement=True)
     scenarios = [womd_record(name, tracks=2 - k) for k, name in enumerate(NAMES)]
     write_records(folder / "a.tfrecord", [each.SerializeToString() for each in scenarios])
     rollouts = [(each.scenario_id, record_rollouts(each)) for each in scenarios]
-    write_submission(rollouts, meta, folder / "a.tar.gz", shards=2)
+    write_submission(rollouts, META, folder / "a.tar.gz", shards=2)
     return folder / "a.tar.gz"
 
 

@@ -13,7 +13,6 @@ import signal
 import sys
 import tempfile
 import time
-import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -24,6 +23,8 @@ import numpy as np
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # a child does not survive the fork of a process with more
 sys.path.append(str(Path(__file__).resolve().parents[1]))
+
+from helpers_processes import fork
 
 TICKS = os.sysconf("SC_CLK_TCK")
 PATIENCE = 600
@@ -48,10 +49,7 @@ class Counts:
 
 
 def torment(target: Target, folder: Path, kills: int, seed: int) -> Counts:
-    """Kill work several times, each time at a random moment of what it takes undisturbed, and compare what is left.
-
-    When it comes to its end before it is killed, it begins again in another folder; so the last one does in the end.
-    """
+    """Kill work several times, each at a random moment of what it takes undisturbed, and compare what is left."""
     rng, counts = np.random.default_rng(seed), Counts()
     status, counts.seconds = live(target, folder / "whole")
     if status:
@@ -77,20 +75,13 @@ def torment(target: Target, folder: Path, kills: int, seed: int) -> Counts:
 
 def live(target: Target, place: Path, limit: float = np.inf) -> tuple[int, float]:
     """Work in a process until it ends or has taken so much CPU time; how it ended and the seconds it had."""
-    sys.stdout.flush()
-    child = os.fork()
-    if child == 0:
-        status = 1
-        try:
-            os.setpgid(0, 0)
-            os.fsync = lambda descriptor: None  # the kernel outlives us
-            target.work(place)
-            status = 0
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stderr.flush()
-            os._exit(status)
+
+    def life() -> None:
+        os.setpgid(0, 0)
+        os.fsync = lambda descriptor: None  # the kernel outlives us
+        target.work(place)
+
+    child = fork(life)
     used, until = 0.0, time.monotonic() + PATIENCE
     while os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
         used = max(used, spent(child))

@@ -53,9 +53,7 @@ def words(root: Path) -> int:
 
 
 def size(root: Path, room: str) -> int:
-    """The lines of a room, of all rooms (`symphony`), of the files beside them (`leaves`) or of `tests`; the words of
-    `docs`.
-    """
+    """The lines of a room, of all (`symphony`), of the files beside them (`leaves`), of `tests`; words of `docs`."""
     package = root / "src" / "symphony"
     if room == "docs":
         return words(root)

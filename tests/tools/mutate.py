@@ -116,10 +116,7 @@ def modules(names: Sequence[str]) -> list[str]:
 
 
 def tests_of(module: str) -> list[str]:
-    """The files of tests that are to notice: those that name the module or, where none does, its room.
-
-    Those that have its name come first, as the first test that fails is enough.
-    """
+    """The files of tests that name the module or, where none does, its room; first those that have its name."""
     texts = {str(file): file.read_text() for file in sorted((ROOT / "tests").rglob("test_*.py"))}
     for name in (module, module.partition(".")[0]):
         found = [file for file, text in texts.items() if re.search(rf"\bsymphony\.{re.escape(name)}\b", text)]

@@ -64,7 +64,13 @@ def save_checkpoint(
     Raises a :class:`CheckpointError` if something can't be stored or the disk refuses; earlier ones stay as they are.
     """
     final = folder / f"step-{step:012d}"
-    states: dict[str, Any] = {"rng": _rng_state(), "extra": dict(extra or {})}
+    numbers = {
+        "python": random.getstate(),
+        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002 - whoever uses the global state must get it back
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
+    }
+    states: dict[str, Any] = {"rng": numbers, "extra": dict(extra or {})}
     states |= {f"module.{name}": module.state_dict() for name, module in modules.items()}
     states |= {f"optimizer.{name}": item.state_dict() for name, item in (optimizers or {}).items()}
     manifest: dict[str, Any] = {"format": FORMAT, "step": step, "torch": torch.__version__, "parts": {}}
@@ -335,12 +341,3 @@ def decode(value: Any, tensors: Mapping[str, Tensor]) -> Any:
     if kind != "tuple":
         raise ValueError(f"unknown kind {kind!r}")
     return tuple(items)
-
-
-def _rng_state() -> dict[str, Any]:
-    return {
-        "python": random.getstate(),
-        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002 - whoever uses the global state must get it back
-        "torch": torch.get_rng_state(),
-        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
-    }
