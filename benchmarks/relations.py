@@ -125,7 +125,7 @@ def _check(one: Relation, before: Sequence[Entry], after: Sequence[Entry]) -> No
         one["missing"] = "no number: both are 0, or a mean over nothing"
         return
     away = value - does if isinstance(does, float) else value if does == "rises" else -value
-    clear = abs(away) > CLEAR * error or math.isinf(value)
+    clear = abs(away) > CLEAR * error  # never of none against few, whose error is not known
     # What stays the same does not fall.
     held = away > 0 or (away == 0 and does not in ("falls", "rises", 1.0))
     one |= {"held": held and (clear or not sampled), "clear": clear, "value": value, "se": error}

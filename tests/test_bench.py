@@ -87,15 +87,17 @@ def test_rates_of_independent_runs_are_binomial(hits: list[bool], confidence: fl
         assert (found.low, found.high) == pytest.approx((100 * low, 100 * high))
 
 
-@pytest.mark.parametrize(("rate", "alike"), [(0.05, 0.6), (0.2, 0.0), (0.5, 0.9)])
-def test_bounds_of_rates_hold_as_often_as_they_say(rate: float, alike: float) -> None:
+@pytest.mark.parametrize(("rate", "alike", "sizes"), [
+    (0.05, 0.6, [5] * 20), (0.2, 0.0, [5] * 20), (0.5, 0.9, [5] * 20), (0.3, 1.0, [40] * 5 + [1] * 25),
+])  # fmt: skip
+def test_bounds_of_rates_hold_as_often_as_they_say(rate: float, alike: float, sizes: list[int]) -> None:
     """Also where the runs of a group share their fate; as runs of their own they would not."""
     rng = np.random.default_rng(0)
-    groups = np.repeat(np.arange(20), 5)
+    groups = np.repeat(np.arange(len(sizes)), sizes)
     held = 0
     for _ in range(50):
-        shared, own = rng.random(20)[groups] < rate, rng.random(100) < rate
-        hit = np.where(rng.random(20)[groups] < alike, shared, own)
+        shared, own = rng.random(len(sizes))[groups] < rate, rng.random(len(groups)) < rate
+        hit = np.where(rng.random(len(sizes))[groups] < alike, shared, own)
         held += estimate((100.0 * hit).tolist(), groups.astype(str).tolist(), 0.95, "rate").high >= 100 * rate
     assert held / 50 >= 0.93
 
@@ -106,6 +108,19 @@ def test_means_have_students_bounds(count: int, confidence: float) -> None:
     found = estimate(values.tolist(), [str(k) for k in range(count)], confidence)
     spread = t_quantile(confidence, count - 1) * values.std(ddof=1) / np.sqrt(count)
     assert (found.low, found.high) == pytest.approx((values.mean() - spread, values.mean() + spread))
+    # One group that is nearly all of it is hardly more than one.
+    names = ["a"] * (20 * count) + [str(k) for k in range(count)]
+    more, even = np.resize(values, 21 * count).tolist(), [str(k % (count + 1)) for k in range(21 * count)]
+    wide, few = (estimate(more, each, confidence) for each in (names, even))
+    assert wide.high - wide.mean > few.high - few.mean
+
+
+@given(st.integers(2, 60), st.sampled_from([0.8, 0.95]))
+def test_of_planners_that_did_nothing_wrong_no_difference_is_known_to_be_none(count: int, confidence: float) -> None:
+    names = [str(k) for k in range(count)]
+    rate = estimate([0.0] * count, names, confidence, "rate")
+    found = estimate([0.0] * count, names, confidence, "difference of rates")
+    assert found.high == -found.low == pytest.approx(rate.high)
 
 
 @given(st.floats(0.1, 60), st.sampled_from([0.8, 0.95, 0.99]))

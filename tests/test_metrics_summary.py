@@ -195,9 +195,11 @@ def test_a_group_without_anything_to_count_is_no_sample() -> None:
     """With two recordings, one of which has no step to compare, there is no error, as with one alone."""
     inputs = random_inputs(7, batch=4) | {"groups": ["a", "a", "b", "c"]}
     inputs["logged"][3] = False
+    inputs["curvature"][3] = inputs["curvature_log"][3] = np.zeros(0)
     full, without = scored(inputs).compute(), scored(part(inputs, [0, 1, 2])).compute()
-    for name in ("ade", "min_sade"):
+    for name in ("ade", "min_sade", "curvature_jsd"):
         assert (full[name], full[f"{name}_se"]) == (without[name], without[f"{name}_se"])
+    assert full["curvature_jsd_corrected"] == without["curvature_jsd_corrected"]
     inputs["logged"][2] = False
     assert math.isnan(scored(inputs).compute()["ade_se"])
     one = scored(inputs | {"groups": 4 * ["a"]}).compute()

@@ -245,7 +245,8 @@ def judged(suite: Suite, pair: Pair, base: Sequence[Run]) -> list[Verdict]:
     for one in _thresholds(suite, pair):
         measure, sure = MEASURES[one.metric], one.confidence or 0.95
         if one.compared:
-            known = estimate(*paired(pair.runs, base, measure.of), sure)
+            kind: Any = "difference of rates" if measure.kind == "rate" else "mean"
+            known = estimate(*paired(pair.runs, base, measure.of), sure, kind)
         else:
             known = measured(pair.runs, measure, sure)
         bound = known.mean if one.confidence is None else known.high if one.side == "at_most" else known.low

@@ -59,7 +59,7 @@ def zero_bound(of: int) -> float:
     return 100.0 * (1.0 - 0.05 ** (1.0 / of))
 
 
-def t_quantile(probability: float, freedom: int) -> float:
+def t_quantile(probability: float, freedom: float) -> float:
     """Return the quantile of Student's t: of a mean of n samples, in standard errors, with n - 1 degrees."""
     if probability == 0.5:
         return 0.0

@@ -249,6 +249,8 @@ class RolloutMetrics:
     def curvature_divergence(self) -> tuple[Divergence, list[str]]:
         """Return the divergence, and the names of its samples: the groups."""
         found = [self.segments[name] for name in sorted(self.segments)]
+        # Segments without a turn on either side are no samples.
+        found = [one for one in found if one.histogram.any() or one.histogram_log.any()] or found
         names, member = np.unique([one.group for one in found], return_inverse=True)
         counts = (np.stack(each) for each in zip(*((s.histogram, s.histogram_log) for s in found), strict=True))
         return sampled_divergence(*(summed(each, member) for each in counts)), names.tolist()
