@@ -205,7 +205,7 @@ class BeamSearchCollector(Collector):
         return elsewhere
 
     def rule_noise(self, start: TensorDictBase) -> Float[Tensor, "*_"]:
-        """Return numbers in [0, 1) for the pruning rule [*env.batch_size, P] , given the start."""
+        """Return numbers in [0, 1) for the pruning rule [*env.batch_size, P], given the start."""
         periods = -(-self.frames_per_batch // self.prune_every)
         if self._rule_noise is not None:
             return self._rule_noise(start, periods)

@@ -118,7 +118,7 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
     away = front[:, :, None] - stop
     along = (away * direction).sum(-1)
     across = away[..., 1] * direction[:, 0] - away[..., 0] * direction[:, 1]
-    passing = (along[:, :-1] < 0) & (along[:, 1:] >= 0)
+    passing = (along[:, :-1] < 0) & (along[:, 1:] >= 0) & (along[:, 1:] < max(15.0, 60.0 * segment.dt))
     passing &= np.abs(across[:, 1:]) <= 0.5 * lanes.width[lane]
     passing &= (forward[:, 1:, None] * direction).sum(-1) > math.cos(SAME_WAY)
     passing &= (world.valid[evaluated, 1:] & world.valid[evaluated, :-1])[..., None]
