@@ -210,6 +210,17 @@ def test_thresholds_that_are_lost_fail(suite: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "log" / "playback" / "view.html").exists()
 
 
+def test_a_rate_compared_with_the_baselines_is_not_known_to_be_equal(suite: Path, tmp_path: Path) -> None:
+    """Nothing happens to two that play back the log; that of 6 groups says little."""
+    both = SUITE.partition("[[threshold]]")[0].replace("planners.py:fast", "log")
+    wanted = '[[threshold]]\nmetric = "failed_rate"\nat_most = 1\ncompared = true\n'
+    suite.write_text(both.replace("[suite]", '[suite]\nbaseline = "log"') + wanted)
+    found = run_suite(read_suite(suite), tmp_path / "out")
+    (one,) = (one for one in found.verdicts if one.threshold.compared)
+    assert (one.found.mean, one.status) == (0.0, "fails")
+    assert all(pair.report.collision_in.keys() == pair.report.events.keys() for pair in found.pairs)
+
+
 def test_stopping_early_changes_no_verdict(suite, tmp_path, monkeypatch):
     text = SUITE.replace("planners.py:fast", "planners.py:broken").replace("80", "20\nconfidence = false")
     suite.write_text(text)

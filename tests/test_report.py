@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from helpers_saved import played, searched
@@ -151,6 +151,7 @@ def test_a_red_light_is_run_where_the_front_crosses_the_stop_point() -> None:
 
 @given(st.floats(2, 20), st.floats(0, 1), st.sampled_from([0.1, 0.2, 1.0]), st.floats(-0.5, 0.5), st.floats(0, 1))
 @settings(max_examples=25)
+@example(20, 0.6, 1.0, 0, 0)
 def test_only_the_light_of_the_own_lane_counts(speed, phase, dt, aside, ahead) -> None:
     """Straight on beside a turning lane, whose stop point lies a little farther on."""
     road, step = crossing_road(200.0), speed * dt
@@ -359,6 +360,7 @@ def test_what_cannot_be_said_is_not_said() -> None:
     found = relations(entries)
     infinite, missing = (of(found, "collision_rate", "bc", method) for method in ("bc_ts", "mgail"))
     assert (infinite["held"], infinite["value"], missing["held"]) == (True, np.inf, None)
+    assert infinite["clear"] is False
     for one in entries:
         one.record["per_segment"] = []  # type: ignore[index]
     with pytest.raises(ConfigError, match="share no run segment"):

@@ -235,6 +235,7 @@ def test_a_simulation_is_kept_whatever_the_batch_and_the_interruptions(tmp_path)
 def read_back(saved, rollout, path):
     file = path / "scenario.xml"
     file.write_text(commonroad(saved, rollout), encoding="utf-8")
+    assert "timeOffset" not in file.read_text(encoding="utf-8")  # the schema knows none of 0
     (item,) = CommonRoadReader().read(file)
     assert isinstance(item, RunSegment), item
     return item

@@ -31,7 +31,7 @@ class Measure:
     of: Callable[[Run], float | None]
     unit: str
     text: str
-    kind: Kind = "mean"
+    kind: Literal["rate", "mean"] = "mean"
 
 
 def _happens(name: str, text: str) -> Measure:

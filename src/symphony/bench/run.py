@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from symphony.agents.agent import load_agent
-from symphony.bench.measures import MEASURES, Estimate, Run, estimate, measured, paired
+from symphony.bench.measures import MEASURES, Estimate, Kind, Run, estimate, measured, paired
 from symphony.bench.published import pdm
 from symphony.bench.suite import Crowd, Suite, SuitePlanner, Threshold
 from symphony.errors import AllFailedError, DataError
@@ -245,7 +245,7 @@ def judged(suite: Suite, pair: Pair, base: Sequence[Run]) -> list[Verdict]:
     for one in _thresholds(suite, pair):
         measure, sure = MEASURES[one.metric], one.confidence or 0.95
         if one.compared:
-            kind: Any = "difference of rates" if measure.kind == "rate" else "mean"
+            kind: Kind = "difference of rates" if measure.kind == "rate" else "mean"
             known = estimate(*paired(pair.runs, base, measure.of), sure, kind)
         else:
             known = measured(pair.runs, measure, sure)
