@@ -140,7 +140,7 @@ def test_speed_limits_of_either_version(path: Path) -> None:
     old = lanelet(11, *ends, "<speedLimit>12.5</speedLimit>")
     assert convert(path, driver(7, "2018b"), old, version="2018b").road.speed_limit.tolist() == [12.5]
     lane = lanelet(11, *ends, '<trafficSignRef ref="5"/><trafficSignRef ref="77"/>')
-    for kind, expected in (("274", 13.5), ("R2-1", 13.5), ("206", np.nan)):
+    for kind, expected in (("274", 13.5), ("R2-1", 13.5), ("274.1", 13.5), ("B14", 13.5), ("206", np.nan)):
         found = convert(path, driver(7), lane, sign.format(kind)).road.speed_limit
         np.testing.assert_array_equal(found, np.float32([expected]))
 

@@ -60,7 +60,7 @@ _LANE_TYPES = (
 _WALKWAYS = frozenset({"sidewalk", "crosswalk"})
 _BESIDE = frozenset({"shoulder", "border", "parking", "restricted"})
 """Parts of the road that lead nowhere."""
-_SPEED_SIGNS = frozenset({"274", "R2-1", "r301", "R301"})
+_SPEED_SIGNS = frozenset({"274", "274.1", "R2-1", "r301", "R301", "3.24", "R15", "C43", "B14", "Ρ-32", "B31"})
 _COLORS = dict.fromkeys(("red", "redYellow"), SignalState.STOP) | {
     "yellow": SignalState.CAUTION,
     "green": SignalState.GO,
