@@ -49,8 +49,13 @@ def test_an_ego_wider_than_long_is_turned(tmp_path: Path) -> None:
     np.testing.assert_allclose(segment.size[[segment.ego, 0]], [(4.08, 1.73, 1.56), (1, 2, 1.5)], rtol=1e-6)
 
 
-def test_what_is_derived_of_the_map(tmp_path: Path) -> None:
-    road = read_one("scenarionet", write(tmp_path)).road
+@pytest.mark.parametrize("dataset", ["nuscenes", "metadrive"])
+def test_what_is_derived_of_the_map(dataset: str, tmp_path: Path) -> None:
+    tree = changed("metadata/dataset", dataset)
+    told = {"exit_lanes": ["on"], "left_neighbor": ["left", "right"], "speed_limit_kmh": 1000}  # no limit
+    for name in ("left", "on") if dataset == "metadrive" else ():  # roads lead to all lanes of the next
+        tree["map_features"][name] |= told
+    road = read_one("scenarionet", write(tmp_path, tree)).road
     links = [each.tolist() for each in (road.successors, road.left_neighbors, road.right_neighbors)]
     assert links == [[[0, 2], [2, 3]], [[0, 1]], [[1, 0]]]
     assert road.lane_type.tolist() == [LaneType.SURFACE_STREET] * 4

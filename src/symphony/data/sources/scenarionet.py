@@ -9,10 +9,10 @@ Pickles can do anything; these are read by :mod:`.safe_pickle`, which admits pla
   turned. The position of nuScenes' ego is that of its rear axle, as logged. Velocities of nuScenes are differences to
   the next position; at the last state of a track, where ScenarioNet writes 0, that of the state before is taken.
 - Coordinates are relative to the ego's first position, rounded to metres, z as logged; maps of nuScenes have none.
-- Successors and neighbours are the source's, or derived from the geometry where it has none (nuScenes): see
-  :func:`_successors` and :func:`_neighbors`. The boundary is the road edges, or goes round the union of the drivable
-  areas (``boundary_…``, if all are closed) and the lanes' areas, open where no lane goes on. The speed limits of
-  nuScenes and Argoverse 2 are made up, and not taken.
+- Successors and neighbours are the source's, or derived from the geometry where it has none (nuScenes) or names all
+  lanes of a road (MetaDrive; neighbours of nuPlan): see :func:`_successors`, :func:`_neighbors`. The boundary is the
+  road edges, or goes round the union of the drivable areas (``boundary_…``, if all are closed) and the lanes' areas,
+  open where no lane goes on. The speed limits of nuScenes and Argoverse 2 are made up, and not taken.
 - A light is one row per lane, at the stop point logged, or where the lane begins: so, too, for nuPlan, for which
   ScenarioNet names a place 8 m further on.
 """
@@ -191,7 +191,7 @@ def _map(scenario: Mapping[Any, Any], dataset: str, origin: Doubles) -> tuple[Ro
             if dataset == "nuscenes":
                 line = line[:, :2]  # the third number is a heading
             if kind in _LANES and len(line):
-                told |= node.get("exit_lanes") is not None
+                told |= node.get("exit_lanes") is not None and dataset != "metadrive"
                 areas.append(area[:, :2] if len(area) > 2 else None)
                 lanes.append(_lane(str(key), node, line, areas[-1], dataset))
             elif kind.startswith("ROAD_EDGE") and len(line) > 1:
@@ -222,9 +222,9 @@ def _map(scenario: Mapping[Any, Any], dataset: str, origin: Doubles) -> tuple[Ro
 def _lane(name: str, node: Mapping[Any, Any], line: Doubles, area: Doubles | None, dataset: str) -> Lane:
     limit = node.get("speed_limit_kmh")
     known = isinstance(limit, int | float) and 0 < limit < 300 and dataset not in _NO_LIMITS
-    # Of nuPlan, ScenarioNet names all lanes of a road, in an order that need not be theirs.
-    sides = (None if dataset == "nuplan" else node.get(f"{side}_neighbor") for side in ("left", "right"))
-    left, right = map(_references, sides)
+    # Of these, ScenarioNet names all lanes of a road, of nuPlan in an order that need not be theirs.
+    told = {} if dataset in {"nuplan", "metadrive"} else node
+    left, right = (_references(told.get(f"{side}_neighbor")) for side in ("left", "right"))
     return Lane(
         name=name,
         line=line,
