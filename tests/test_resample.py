@@ -180,11 +180,11 @@ def test_lost_frames_are_filled_in_between(first: int, count: int) -> None:
     kept = np.delete(np.arange(91), np.arange(first, min(first + count, 90)))
     found = evened(seen_at(TENTH[kept]), TENTH[kept])
     assert (time_step(TENTH[kept], "times"), found.num_steps) == (0.1, 91)
+    assert [time_step(kept / rate, "times") * rate for rate in (15, 29.97, 30)] == pytest.approx([1, 1, 1], rel=1e-9)
     assert found.odd == {LOST: f"{91 - len(kept)} of 91"}
-    whole = scene()
-    np.testing.assert_array_equal(found.position[:, kept], whole.position[:, kept])
+    np.testing.assert_array_equal(found.position[:, kept], scene().position[:, kept])
     assert found.valid.all()
-    np.testing.assert_allclose(found.position, whole.position, atol=0.3)  # m, of a car that accelerates
+    np.testing.assert_allclose(found.position, scene().position, atol=0.3)  # m, of a car that accelerates
     validate(found)
 
 

@@ -227,18 +227,14 @@ def time_step(times: Doubles, field: str) -> float:
     log. A :class:`DataError` says if more than a third of the steps differ from it, or half of them are missing.
     """
     gaps = np.diff(times)
-    mean = float(gaps.mean())
-    dt = round(mean, 3)
-    dt = dt if abs(dt - mean) <= 1e-3 * mean else mean
-    if dt > 0 and (np.abs(gaps - dt) <= EVEN * dt).all():
-        return dt
     usual = float(np.median(gaps))
     steps = np.rint(gaps / usual) if usual > 0 else gaps
-    even = (steps == 1) & (np.abs(gaps - usual) <= 0.5 * usual)
-    if not (usual > 0 and 0 < steps.sum() <= 2 * len(gaps) and even.mean() >= 2 / 3):
+    single = (steps == 1) & (np.abs(gaps - usual) <= 0.5 * usual)
+    if not (usual > 0 and 0 < steps.sum() <= 2 * len(gaps) and single.mean() >= 2 / 3):
         raise DataError(f"steps of {gaps.min():g} to {gaps.max():g} s are uneven", field=field)
     mean = float((times[-1] - times[0]) / steps.sum())
-    return round(mean, 3) if abs(round(mean, 3) - mean) <= 1e-2 * mean else mean
+    even = (np.abs(gaps - steps * mean) <= EVEN * mean).all()
+    return round(mean, 3) if abs(round(mean, 3) - mean) <= (1e-3 if even else 1e-2) * mean else mean
 
 
 def busiest_first(
