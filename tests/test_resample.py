@@ -128,16 +128,17 @@ def test_the_heading_follows_the_motion_only_when_moving() -> None:
     assert np.abs(np.diff(starting.heading)).max() < 0.05
 
 
-@pytest.mark.parametrize("every", [1, 3])
-def test_a_light_seen_between_picked_steps_is_not_lost(every: int) -> None:
-    """Against a plain loop: the latest known state since the picked step before, if it is unknown now."""
-    rng = np.random.default_rng(every)
+@pytest.mark.parametrize("every", [0.5, 1, 2.5, 3])
+def test_a_light_seen_between_new_steps_is_not_lost(every: float) -> None:
+    """Against a plain loop: the latest known state since the new step before, if it is unknown now."""
+    rng = np.random.default_rng(int(every))
     segment = crossing(steps=31)
     state = rng.integers(0, 9, segment.signal_state.shape) * (rng.random(segment.signal_state.shape) < 0.3)
     found = resample(segment.replace(signal_state=state.astype(np.uint8)), every * segment.dt)
     for light, row in enumerate(state):
         for k in range(found.num_steps):
-            known = [x for x in row[max(every * (k - 1) + 1, 0) : every * k + 1] if x]
+            now = int(every * k)
+            known = [x for x in row[max(min(int(every * (k - 1)) + 1, now), 0) : now + 1] if x]
             assert found.signal_state[light, k] == (known[-1] if known else 0)
 
 

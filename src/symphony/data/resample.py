@@ -32,11 +32,10 @@ def resample(segment: RunSegment, dt: float) -> RunSegment:
     """Return a valid segment with steps of ``dt`` seconds, beginning at the same moment.
 
     Where ``dt`` is a whole multiple of the segment's own step (10 Hz to 5 Hz), steps are picked and nothing is
-    computed; a light unknown at a picked step has the latest state known since the one before (some WOMD records
-    have lights at a single step). Otherwise positions and velocities are interpolated linearly, and headings along
-    the shorter arc, between two neighbouring valid steps; an agent is valid where both are. A light keeps the state
-    of the latest logged step, and ``current_step`` becomes the latest new step not after the old one. A
-    :class:`DataError` says if too few or too many steps would remain, or the ego would be valid at none.
+    computed. Otherwise positions and velocities are interpolated linearly, and headings along the shorter arc,
+    between two neighbouring valid steps; an agent is valid where both are. A light has the latest state known since
+    the new step before (some WOMD records show lights at one), and ``current_step`` is the latest new step not after
+    the old one. A :class:`DataError` says if too few or too many steps would remain, or the ego would be at none.
     """
     if not schema.MIN_DT <= dt <= schema.MAX_DT:
         raise ConfigError(f"dt must be between {schema.MIN_DT:g} and {schema.MAX_DT:g} s, is {dt}")
@@ -48,14 +47,17 @@ def resample(segment: RunSegment, dt: float) -> RunSegment:
 
 
 def _pick(segment: RunSegment, every: int, dt: float) -> RunSegment:
-    state = segment.signal_state
-    lights = state[:, ::every].copy()
-    later = lights[:, 1:]  # the first picked step has none before it
-    for back in range(1, every):
-        before = state[:, every - back :: every][:, : later.shape[1]]
-        later[later == SignalState.UNKNOWN] = before[later == SignalState.UNKNOWN]
+    lights = _lights(segment.signal_state, np.arange(0, segment.num_steps, every))
     picked = {name: getattr(segment, name)[:, ::every].copy() for name in STATES}
     return segment.replace(dt=dt, signal_state=lights, current_step=segment.current_step // every, **picked)
+
+
+def _lights(state: Ints, steps: Ints) -> Ints:
+    """Return [Q, U] the states at steps [U]; where none is known, the latest one known since the step before."""
+    known = np.where(state != SignalState.UNKNOWN, np.arange(state.shape[1]), -1)
+    last = np.maximum.accumulate(known, axis=1)[:, steps]
+    since = np.minimum(np.append(steps[:1], steps[:-1]), steps - 1)  # the first one has none before it
+    return np.where(last > since, np.take_along_axis(state, last, axis=1), np.uint8(SignalState.UNKNOWN))
 
 
 def hold_lights(segment: RunSegment) -> RunSegment:
@@ -65,8 +67,7 @@ def hold_lights(segment: RunSegment) -> RunSegment:
     """
     state = segment.signal_state
     known = state != SignalState.UNKNOWN
-    steps = np.arange(state.shape[1])
-    last = np.maximum.accumulate(np.where(known, steps, -1), axis=1)
+    last = np.maximum.accumulate(np.where(known, np.arange(state.shape[1]), -1), axis=1)
     source = np.where(last < 0, known.argmax(1)[:, None], last)
     return segment.replace(signal_state=np.take_along_axis(state, source, axis=1))
 
@@ -134,7 +135,7 @@ def _between(segment: RunSegment, before: Ints, after: Ints, share: Doubles) -> 
         heading=_masked(heading[:, before] + share * turn, valid),
         velocity=_masked(between(segment.velocity), valid),
         valid=valid,
-        signal_state=segment.signal_state[:, before],
+        signal_state=_lights(segment.signal_state, before),
     )
 
 
