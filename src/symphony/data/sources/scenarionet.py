@@ -112,12 +112,14 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
 def _tracks(scenario: Mapping[Any, Any], steps: int) -> tuple[list[str], list[int], Doubles, Bools]:
     """Return names [A], types [A], states [A, T, 9] and where they are valid [A, T], of tracks valid at some step."""
     found: list[tuple[str, int, Doubles, Bools]] = []
+    nothing = Array()  # the sides of what names none: the cones of MetaDrive
+    nothing.value = np.zeros(steps)
     with located(field="tracks"):
         tracks = scenario["tracks"].items()
         schema.check_counts(len(tracks), steps, "tracks")
     for key, track in tracks:
         with located(field=f"tracks {str(key)[:60]}"):
-            state = track["state"]
+            state = dict.fromkeys(("length", "width", "height"), nothing) | track["state"]
             parts = [_numbers(state[name], name, steps, width) for name, width in _STATE.items()]
             valid = parts[0][:, 0] > 0
             states = np.where(valid[:, None], np.concatenate(parts[1:], axis=1), 0.0)
