@@ -170,8 +170,9 @@ def test_lights_keep_the_latest_state_seen():
     state = np.full((1, 91), SignalState.GO, np.uint8)
     state[0, 4], state[0, 5:11] = SignalState.STOP, SignalState.UNKNOWN
     start = validate(history_only(segment.replace(signal_state=state), 0.2))
-    assert start.num_steps == 41
-    assert (start.signal_state == SignalState.STOP).all()
+    assert (start.num_steps, np.unique(start.signal_state).tolist()) == (41, [SignalState.STOP])
+    state[0, :11] = SignalState.UNKNOWN  # That there is a light at all is then seen later.
+    assert len(validate(history_only(segment.replace(signal_state=state), 0.2)).signal_lane) == 0
 
 
 def test_submission(tmp_path, capsys):

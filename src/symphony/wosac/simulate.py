@@ -203,13 +203,14 @@ def with_the_rest(found: SimulatedRollouts, segment: RunSegment) -> SimulatedRol
 
 def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSegment:
     """Return what a simulator may know, as a segment to drive in, with steps of ``dt`` seconds: it begins with the
-    current step, all agents that are valid then go on at constant velocity, and lights keep their latest state.
+    current step, all agents that are valid then go on at constant velocity, and lights keep their latest state;
+    those without one, which the log may show later, are not there.
     """
-    rows, now = _present(segment), segment.current_step
+    rows, now, shown = _present(segment), segment.current_step, _latest(segment)
+    lights = shown != SignalState.UNKNOWN
     steps = math.ceil(future * DT / dt - 1e-6) + 1
-    velocity = segment.velocity[rows, now].astype(np.float64)
     path = np.repeat(segment.position[rows, now, None].astype(np.float64), steps, 1)
-    path[..., :2] += velocity[:, None] * (np.arange(steps) * dt)[:, None]
+    path[..., :2] += segment.velocity[rows, now, None] * (np.arange(steps) * dt)[:, None]
     return _from_now_on(
         segment,
         rows,
@@ -218,7 +219,9 @@ def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSeg
         heading=np.repeat(segment.heading[rows, now, None], steps, 1),
         velocity=np.repeat(segment.velocity[rows, now, None], steps, 1),
         valid=np.ones((len(rows), steps), bool),
-        signal_state=np.repeat(_latest(segment)[:, None], steps, 1),
+        signal_lane=segment.signal_lane[lights],
+        signal_point=segment.signal_point[lights],
+        signal_state=np.repeat(shown[lights, None], steps, 1),
     )
 
 
