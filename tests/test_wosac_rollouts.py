@@ -249,6 +249,8 @@ def test_short_logs_have_a_shorter_history():
     assert score(wosac_scenario(window), constant_velocity(window))["min_ade"] < 0.01
     with pytest.raises(DataError, match=r"has 7\.8 s, the score needs 8"):
         wosac_window(straight_road(steps=40))
+    with pytest.raises(DataError, match="field current_step: is 0, needs 10"):
+        constant_velocity(straight_road(steps=5, dt=0.1))
 
 
 def test_a_shorter_horizon_is_the_beginning_of_the_whole():

@@ -253,7 +253,7 @@ def between_decisions(states: Doubles, dt: float, future: int = FUTURE) -> Doubl
 
 def _present(segment: RunSegment) -> NDArray[np.int64]:
     """Return [n] rows of the agents that are valid at the current step."""
-    rows = np.flatnonzero(segment.valid[:, CURRENT])
+    rows = np.flatnonzero(segment.valid[:, segment.current_step])
     for wrong, message, field in (
         (abs(segment.dt - DT) > 1e-6, f"has steps of {segment.dt:g} s, needs {DT:g}", "dt"),
         (segment.current_step != CURRENT, f"is {segment.current_step}, needs {CURRENT}", "current_step"),
