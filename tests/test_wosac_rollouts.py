@@ -405,8 +405,7 @@ def test_evaluation(tmp_path):
     steady = found["agents"]["constant_velocity"]["segments"][logs[1].segment_id]
     assert steady == pytest.approx(score(wosac_scenario(window), constant_velocity(window, future=10)))
     # One recording has no error; a part of the store can be named; baselines search for nothing.
-    tree = ("--search", "tree", "--branches", "2", "--horizon", "1", "--segments", "2", "--config", "2024")
-    found = record(*tree)
+    found = record("--search", "tree", "--branches", "2", "--horizon", "1", "--segments", "2", "--config", "2024")
     assert (found["config"], found["how"]["search"]) == ("2024", "tree")
     assert list(found["agents"][AGENT]["segments"]) == [logs[2].segment_id]
     assert found["agents"][AGENT]["metametric_se"] is None
