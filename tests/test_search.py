@@ -456,7 +456,7 @@ def test_agents_are_searched_as_they_are_meant_to_be(store):
     assert blind.plan(EvaluateConfig()).kind == "none"
     assert blind.plan(EvaluateConfig(rollouts=1, score="rule")).kind == "tree"
     assert evaluate("constant_velocity", store, replace(LINES, rollouts=1), items=[0]).search == "backtrack"
-    with pytest.raises(ConfigError, match="another score: --score flags or rule"):
+    with pytest.raises(ConfigError, match="another score: --score rule"):
         blind.plan(EvaluateConfig(search="backtrack"))
     for name in ("bc_rl", "bc_ts_h"):
         plan = load_agent(f"pretrained:{name}").plan(EvaluateConfig())

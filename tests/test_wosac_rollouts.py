@@ -170,8 +170,9 @@ def test_lights_keep_the_latest_state_seen():
     state = np.full((1, 91), SignalState.GO, np.uint8)
     state[0, 4], state[0, 5:11] = SignalState.STOP, SignalState.UNKNOWN
     start = validate(history_only(segment.replace(signal_state=state), 0.2))
-    assert start.num_steps == 41
-    assert (start.signal_state == SignalState.STOP).all()
+    assert (start.num_steps, np.unique(start.signal_state).tolist()) == (41, [SignalState.STOP])
+    state[0, :11] = SignalState.UNKNOWN  # That there is a light at all is then seen later.
+    assert len(validate(history_only(segment.replace(signal_state=state), 0.2)).signal_lane) == 0
 
 
 def test_submission(tmp_path, capsys):
@@ -248,6 +249,8 @@ def test_short_logs_have_a_shorter_history():
     assert score(wosac_scenario(window), constant_velocity(window))["min_ade"] < 0.01
     with pytest.raises(DataError, match=r"has 7\.8 s, the score needs 8"):
         wosac_window(straight_road(steps=40))
+    with pytest.raises(DataError, match="field current_step: is 0, needs 10"):
+        constant_velocity(straight_road(steps=5, dt=0.1))
 
 
 def test_a_shorter_horizon_is_the_beginning_of_the_whole():
@@ -402,8 +405,7 @@ def test_evaluation(tmp_path):
     steady = found["agents"]["constant_velocity"]["segments"][logs[1].segment_id]
     assert steady == pytest.approx(score(wosac_scenario(window), constant_velocity(window, future=10)))
     # One recording has no error; a part of the store can be named; baselines search for nothing.
-    tree = ("--search", "tree", "--branches", "2", "--horizon", "1", "--segments", "2", "--config", "2024")
-    found = record(*tree)
+    found = record("--search", "tree", "--branches", "2", "--horizon", "1", "--segments", "2", "--config", "2024")
     assert (found["config"], found["how"]["search"]) == ("2024", "tree")
     assert list(found["agents"][AGENT]["segments"]) == [logs[2].segment_id]
     assert found["agents"][AGENT]["metametric_se"] is None

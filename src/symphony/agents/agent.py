@@ -201,7 +201,7 @@ class Agent:
             kind = search.way if self.searches and not blind else "none"
         if kind not in ("log", "none") and blind:
             what = f"search '{kind}' needs an agent with a discriminator, {self.name} has none"
-            raise ConfigError(f"{what}, or another score: --score flags or rule")
+            raise ConfigError(f"{what}, or another score: --score rule")
         branches, trees = search.test_branches, config.trees
         if kind != "tree":
             return SearchPlan(kind, config.rollouts, 1, 1, search)

@@ -104,11 +104,10 @@ def wosac_scenario(window: RunSegment) -> WosacScenario:
 def log_playback(window: RunSegment) -> SimulatedRollouts:
     """Return 32 copies of the log of a :func:`wosac_window`; agents that it does not see are far from all others."""
     rows, later = np.flatnonzero(window.valid[:, CURRENT]), slice(CURRENT + 1, None)
-    place = (window.position[rows, later] + window.origin).astype(np.float64)
     away = np.zeros((len(rows), 1, 3))
     away[:, 0, 0] = _AWAY + _APART * np.arange(len(rows))
-    place = np.where(window.valid[rows, later, None], place, away + window.origin)
-    states = np.concatenate([place, window.heading[rows, later, None].astype(np.float64)], -1)
+    place = np.where(window.valid[rows, later, None], window.position[rows, later], away) + window.origin
+    states = np.concatenate([place, window.heading[rows, later, None]], -1)
     return SimulatedRollouts(window.agent_id[rows], *np.moveaxis(np.repeat(states[None], ROLLOUTS, 0), -1, 0))
 
 
@@ -125,10 +124,8 @@ class PassingGaps(NamedTuple):
 def passing_pairs(window: RunSegment) -> NDArray[np.int64]:
     """Return [K, 2] rows of the vehicles that merge or cross in the log after the current step, both valid at it."""
     now = window.current_step
-    timed = ("position", "heading", "velocity", "valid", "signal_state")
-    future = window.replace(
-        dt=window.dt * EVERY, current_step=0, **{name: getattr(window, name)[:, now::EVERY] for name in timed}
-    )
+    later = {name: getattr(window, name)[:, now::EVERY] for name in _TIMED}
+    future = window.replace(dt=window.dt * EVERY, current_step=0, **later)
     rows = np.flatnonzero(window.valid[:, now] & (window.agent_type == AgentType.VEHICLE))
     pairs = []
     for k, row in enumerate(rows[:-1]):
@@ -202,15 +199,11 @@ class WosacEvaluation:
         errors = {f"{name}_se": None if math.isnan(error) else error for name, (_, error) in numbers.items()}
         return {**{name: mean for name, (mean, _) in numbers.items()}, **errors}
 
-    def order(self, agent: str) -> OrderStatistics:
-        """Return the passing order of all pairs of vehicles that merge or cross in the logs."""
-        return order_of([one.passing for one in self.results[agent]])
-
     def record(self) -> dict[str, Any]:
         """Return the record in types that JSON can hold."""
         agents = {}
         for name, found in self.results.items():
-            order = dataclasses.asdict(self.order(name))
+            order = dataclasses.asdict(order_of([one.passing for one in found]))
             agents[name] = {
                 **self.flat(name),
                 "order": {key: None if math.isnan(value) else value for key, value in order.items()},

@@ -71,7 +71,7 @@ def logged_scenario(scenario: pb.Scenario) -> WosacScenario:
 
     Raises a :class:`DataError` where it can't be scored; names scenario and field.
     """
-    _check_times(scenario)
+    check_times(scenario)
     _check_steps(scenario, STEPS)
     tracks = scenario.tracks
     numbers = chain.from_iterable(map(_STATE, chain.from_iterable(track.states for track in tracks)))
@@ -102,11 +102,12 @@ def logged_scenario(scenario: pb.Scenario) -> WosacScenario:
     )
 
 
-def _check_times(scenario: pb.Scenario) -> None:
+def check_times(scenario: pb.Scenario, least: int = STEPS) -> None:
+    """Check that a scenario has at least so many steps, each of 0.1 s. Raises a :class:`DataError` that names it."""
     times = np.array(scenario.timestamps_seconds, np.float64)
     gaps, problem = np.diff(times), ""
-    if len(times) != STEPS:
-        problem = f"{len(times)} steps, needs {STEPS}"
+    if not least <= len(times) <= STEPS:
+        problem = f"{len(times)} steps, needs {least}"
         if len(times) == CURRENT + 1:
             problem += "; the test set's future is not public, so it can't be scored"
     # The score takes every step for 0.1 s. Recordings jitter; a step left out or another rate is something else.

@@ -37,7 +37,7 @@ from symphony.rollouts.driving import simulation
 from symphony.rollouts.unroll import NotFiniteError, Rollouts
 from symphony.rollouts.workers import shared
 from symphony.streams import Stream, fold_in, stream_of, uniform
-from symphony.wosac.records import parse_scenario, read_scenarios
+from symphony.wosac.records import check_times, parse_scenario, read_scenarios
 from symphony.wosac.scorer import SimulatedRollouts
 from symphony.wosac.scorer.config import CURRENT, DT, FUTURE, ROLLOUTS
 from symphony.wosac.scorer.scenario import STATES
@@ -178,6 +178,12 @@ def _simulated(
     file, record, payload = packed
     scenario = parse_scenario(payload, file, record)
     try:
+        check_times(scenario, CURRENT + 1)
+        # What comes later decides nothing, such as which part of a track that jumps is odd.
+        for timed in (scenario.dynamic_map_states, *(track.states for track in scenario.tracks)):
+            del timed[CURRENT + 1 :]
+        # As in the score, a step is 0.1 s however recordings jitter: no other step, no states in between.
+        scenario.timestamps_seconds[:] = DT * np.arange(CURRENT + 1)
         whole = scenario_to_segment(scenario, file=file.name)
         found = wosac_rollouts(agent, validate(mended(whole)), settings)
         return scenario.scenario_id, with_the_rest(found, whole)
@@ -203,13 +209,14 @@ def with_the_rest(found: SimulatedRollouts, segment: RunSegment) -> SimulatedRol
 
 def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSegment:
     """Return what a simulator may know, as a segment to drive in, with steps of ``dt`` seconds: it begins with the
-    current step, all agents that are valid then go on at constant velocity, and lights keep their latest state.
+    current step, all agents that are valid then go on at constant velocity, and lights keep their latest state;
+    those without one, which the log may show later, are not there.
     """
-    rows, now = _present(segment), segment.current_step
+    rows, now, shown = _present(segment), segment.current_step, _latest(segment)
+    lights = shown != SignalState.UNKNOWN
     steps = math.ceil(future * DT / dt - 1e-6) + 1
-    velocity = segment.velocity[rows, now].astype(np.float64)
     path = np.repeat(segment.position[rows, now, None].astype(np.float64), steps, 1)
-    path[..., :2] += velocity[:, None] * (np.arange(steps) * dt)[:, None]
+    path[..., :2] += segment.velocity[rows, now, None] * (np.arange(steps) * dt)[:, None]
     return _from_now_on(
         segment,
         rows,
@@ -218,7 +225,9 @@ def history_only(segment: RunSegment, dt: float, future: int = FUTURE) -> RunSeg
         heading=np.repeat(segment.heading[rows, now, None], steps, 1),
         velocity=np.repeat(segment.velocity[rows, now, None], steps, 1),
         valid=np.ones((len(rows), steps), bool),
-        signal_state=np.repeat(_latest(segment)[:, None], steps, 1),
+        signal_lane=segment.signal_lane[lights],
+        signal_point=segment.signal_point[lights],
+        signal_state=np.repeat(shown[lights, None], steps, 1),
     )
 
 
@@ -250,7 +259,7 @@ def between_decisions(states: Doubles, dt: float, future: int = FUTURE) -> Doubl
 
 def _present(segment: RunSegment) -> NDArray[np.int64]:
     """Return [n] rows of the agents that are valid at the current step."""
-    rows = np.flatnonzero(segment.valid[:, CURRENT])
+    rows = np.flatnonzero(segment.valid[:, segment.current_step])
     for wrong, message, field in (
         (abs(segment.dt - DT) > 1e-6, f"has steps of {segment.dt:g} s, needs {DT:g}", "dt"),
         (segment.current_step != CURRENT, f"is {segment.current_step}, needs {CURRENT}", "current_step"),

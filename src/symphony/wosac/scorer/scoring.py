@@ -24,11 +24,7 @@ _FLAGS = {
     "traffic_light_violation": "traffic_light_violation_per_step",
 }
 """Features that the yes-or-no components come from."""
-_RATES = {
-    "simulated_collision_rate": "collision_per_step",
-    "simulated_offroad_rate": "offroad_per_step",
-    "simulated_traffic_light_violation_rate": "traffic_light_violation_per_step",
-}
+_RATES = {f"simulated_{flag.removesuffix('_per_step')}_rate": flag for flag in _FLAGS.values()}
 
 
 def score(
