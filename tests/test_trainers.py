@@ -230,15 +230,17 @@ def test_recipe(run_script: Any, splits: Path, tmp_path: Path, method: str, caps
     assert f"{found['ade']:.2f}" in capsys.readouterr().out
 
 
-def test_a_changed_copy_elsewhere_is_what_runs(run_script, tmp_path, capsys):
+def test_a_changed_copy_elsewhere_is_what_runs(run_script, tmp_path, capsys, monkeypatch):
     fill(tmp_path / "data", [crossing(4, steps=8)])
     source, update = (SCRIPTS / "bc.py").read_text(encoding="utf-8"), 'yield "policy", policy_loss(experts)'
-    assert update in source
     changed = tmp_path / "mine.py"
     changed.write_text(source.replace(update, f'{update}; print("mine")'), encoding="utf-8")
     # Mistakes are told in a line before the training.
-    assert run_script(changed, f"--data data --test none --out run {COMMON}") == 1
-    assert "none: no such directory" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
+    for words, told in (("none", "none: no such directory"), ("data --rollouts 0", "rollouts must be positive")):
+        assert run_script(changed, f"--data data --out run {COMMON} --test {words}") == 1
+        assert told in capsys.readouterr().err
+        assert not (tmp_path / "run").exists()
+    monkeypatch.setenv("RANK", "1")  # of several processes the first evaluates
     assert run_script(changed, f"--data data --test data --out run {COMMON}") == 0
     assert capsys.readouterr().out.count("mine\n") == 3  # updates
+    assert not (tmp_path / "run" / "evaluations").exists()
