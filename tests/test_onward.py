@@ -228,7 +228,8 @@ def test_what_becomes_of_agents_that_collide(after):
 def test_wrong_settings_are_refused():
     with pytest.raises(DataError, match="vehicles would enter past its log, at most 512"):
         extended(straight_road(), 9000, inflow=1.0)
-    for wrong in ({"inflow": -0.1}, {"inflow": 2.0}, {"lights": (3.0, 1.0)}, {"lights": (0.0, 3.0, 2.0)}):
+    lights = (3.0, 1.0), (0.0, 3.0, 2.0), (3.0, float("nan"), 2.0)
+    for wrong in ({"inflow": -0.1}, {"inflow": 2.0}, *({"lights": one} for one in lights)):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             SimulateConfig(**wrong)
     for after, why in (("remove", "'remove' needs open traffic"), ("explode", "after_collision is one of")):

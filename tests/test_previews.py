@@ -205,19 +205,20 @@ def test_a_run_is_named_once_at_weights_and_biases_and_its_variables_hold(tmp_pa
     import wandb
 
     told: list[dict[str, Any]] = []
-    monkeypatch.delenv("WANDB_MODE", raising=False)
+    monkeypatch.setenv("WANDB_MODE", "")  # as if it were not set
     monkeypatch.setattr(wandb, "init", lambda **given: told.append(given))
     for after in (0, 3, 0, 3):  # the second and the fourth go on
         Tracker(tmp_path, {}, "offline", after=after).close()
         monkeypatch.setenv("WANDB_PROJECT", "mine")
         if len(told) == 3:
             (tmp_path / "wandb-id").write_text("../other\n")
-    assert [given["project"] for given in told] == ["symphony", "mine", "mine", "mine"]
+    assert [f"{given['mode']} {given['project']}" for given in told] == ["offline symphony", *["offline mine"] * 3]
     assert not {"group", "tags"} & told[0].keys()  # else its own variables would not be looked at
     assert [given["resume"] for given in told[:3]] == [None, "allow", None]
     assert told[0]["id"] == told[1]["id"] != told[2]["id"]
     assert re.fullmatch(r"[0-9a-f]{8}", told[3]["id"])
-    locked = wandb.errors.UsageError("No API key configured.\nlog in.")
+    locked = wandb.errors.UsageError("No API key configured.\nlog in."), ValueError("mode: input should be")
     monkeypatch.setattr(wandb, "init", Mock(side_effect=locked))
-    with pytest.raises(ConfigError, match=r"^Weights & Biases: No API key .*log in\. .*--wandb offline$"):
-        Tracker(tmp_path, {}, "online")
+    for why in (r"No API key .*log in\.", "mode: input should be"):
+        with pytest.raises(ConfigError, match=rf"^Weights & Biases: {why} .*WANDB_MODE=offline$"):
+            Tracker(tmp_path, {}, "online")

@@ -20,6 +20,7 @@ from helpers_store import fill, stored
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import CheckpointError, checkpoints, save_checkpoint
 from symphony.agents.choice import Best, choose, split_name
+from symphony.cli.agents import Train
 from symphony.config import EvaluateConfig, TrainConfig, ValidationConfig
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation import evaluate
@@ -108,7 +109,7 @@ def test_a_warm_start_takes_the_best_too(store, held_out, tmp_path, scripted):
         assert same_weights(weights(train(still)), weights(f"{source}@{step}"))
 
 
-def test_a_resumed_run_remembers_the_best(store, held_out, tmp_path, scripted):
+def test_a_resumed_run_remembers_the_best(store, held_out, tmp_path, scripted, capsys):
     whole = config(store, tmp_path / "run", held_out, steps=12)
     scripted(30.0, 10.0, 20.0, 20.0, 20.0, 20.0)
     train(whole)
@@ -121,8 +122,9 @@ def test_a_resumed_run_remembers_the_best(store, held_out, tmp_path, scripted):
     train(replace(whole, resume=True, steps=14))
     assert (steps(whole.out), choose(whole.out).name[-2:]) == ([10, 12, 14], "14")
     # And without evaluations from here on.
-    train(replace(whole, resume=True, steps=24, validation=ValidationConfig(rollouts=2)))
+    Train(config=replace(whole, resume=True, steps=24, validation=ValidationConfig(rollouts=2)))()
     assert (steps(whole.out), choose(whole.out).name[-2:]) == ([14, 20, 22, 24], "14")
+    assert "4: the best one, with collision rate plus off-road time of 9.00 % in val" in capsys.readouterr().out
 
 
 def test_what_is_evaluated_stays_the_same_when_a_run_goes_on(store, held_out, tmp_path):

@@ -38,13 +38,12 @@ class Train(shared.Command):
     def __call__(self) -> None:
         from symphony.agents.choice import best_of, choose
 
-        folder, validation = symphony.train(self.config), self.config.validation
+        folder = symphony.train(self.config)
         if os.environ.get("RANK", "0") != "0":  # of the processes that torchrun starts, one prints
             return
         score = "the last one; nothing was validated, see --validation.data"
         if (best := best_of(choose(folder, "last"))) is not None:
-            score = f"the best one, with collision rate plus off-road time of {best.infractions:.2f} % on "
-            score += f"segments of {validation.data} (at most {validation.segments})"
+            score = f"the best one, with collision rate plus off-road time of {best.infractions:.2f} % in validation"
         shared.say(f"trained agent  {folder}\ncheckpoint     {choose(folder).name}: {score}")
         shared.say(f"curves         symphony plot curves {folder} --out curves.png")
         shared.say(f"evaluate it    symphony evaluate {folder} --data DIR")

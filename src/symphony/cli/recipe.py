@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,8 +32,10 @@ def main(recipe: Any, description: str | None, args: Sequence[str] | None = None
 
     settings = tyro.cli(Arguments, description=description, args=expanded([recipe.__name__, *args]))
     symphony.SegmentStore(settings.test)  # fails now, not after the training
-    folder, training = train(settings.config, recipe), settings.config
+    training = settings.config
     how: Any = {"seed": training.seed, "device": training.device, "compile": training.compile}
     config = symphony.EvaluateConfig(rollouts=settings.rollouts, **how)
-    # Its folder names what the user typed a moment ago.
-    Evaluate(agent=str(folder), data=settings.test, trust_code=True, config=config)()
+    folder = train(training, recipe)
+    if os.environ.get("RANK", "0") == "0":  # of the processes that torchrun starts, one evaluates
+        # Its folder names what the user typed a moment ago.
+        Evaluate(agent=str(folder), data=settings.test, trust_code=True, config=config)()

@@ -156,7 +156,7 @@ class SimulateConfig(EvaluateConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.lights and not (len(self.lights) == 3 and self.lights[0] > 0 and min(self.lights) >= 0):
+        if self.lights and not (len(self.lights) == 3 and self.lights[0] > 0 and all(x >= 0 for x in self.lights)):
             raise ConfigError(f"lights are three lengths in seconds, green above 0: not {self.lights}")
 
 

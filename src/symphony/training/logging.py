@@ -47,7 +47,7 @@ class Tracker:
         # Put in place as a whole, so that a kill meanwhile cannot lose what is kept.
         write_file(self.path, "".join(json.dumps(record) + "\n" for record in self.kept))
         self._run = None
-        mode = os.environ.get("WANDB_MODE", wandb)
+        mode = os.environ.get("WANDB_MODE") or wandb
         if mode != "disabled":
             import wandb as tracking  # noqa: PLC0415 - seconds to import, and often not wanted
 
@@ -56,8 +56,8 @@ class Tracker:
             how |= {"resume": "allow" if after else None}
             try:
                 self._run = tracking.init(**how, settings=tracking.Settings(silent=True, console="off"))
-            except tracking.errors.Error as error:
-                told, hint = " ".join(str(error).split()), "Or keep the curves here: --wandb offline"
+            except (tracking.errors.Error, ValueError) as error:  # the latter of a variable such as WANDB_MODE
+                told, hint = " ".join(str(error).split()), "Or keep the curves here: WANDB_MODE=offline"
                 raise ConfigError(f"Weights & Biases: {told} {hint}") from error
         with naming(self.path):
             self._file = self.path.open("a", encoding="utf-8")

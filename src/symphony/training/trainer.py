@@ -218,13 +218,7 @@ class Trainer:
         self.best: Best | None = None
         self.validated: str | None = None
         speed = TextColumn("loss {task.fields[loss]}, {task.fields[speed]} updates/s, left")
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            speed,
-            TimeRemainingColumn(),
-        )
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), speed, TimeRemainingColumn())
         self.progress = Progress(*columns, console=Console(stderr=True), disable=not processes.is_main)
         self.tracker: Tracker | None = None
         self.checksum = data.checksum()
@@ -256,9 +250,6 @@ class Trainer:
         # Kept with checkpoints like torch's, which the recipe has seeded: those of equal runs are equal files.
         random.seed(config.seed)
         np.random.seed(config.seed % 2**32)  # noqa: NPY002
-        if self.world.is_main:
-            write_file(config.out / "config.json", to_json(config))
-            write_file(config.out / FILE, to_json(self.agent.spec))
         if self.done is not None:
             loaded = load_checkpoint(self.done, modules=self.agent.modules, optimizers=self.optimizers)
             step = loaded.step
@@ -266,6 +257,9 @@ class Trainer:
                 self._restore(loaded.extra)
             except CheckpointError as error:
                 raise error.at(file=self.done / MANIFEST) from error
+        if self.world.is_main:
+            write_file(config.out / "config.json", to_json(config))
+            write_file(config.out / FILE, to_json(self.agent.spec))
         self.alarms = Alarms()
         for before, phase in pairwise(self.phases):
             if before.until >= config.steps:
@@ -447,6 +441,8 @@ def checkpoint_to_resume(config: RunConfig) -> Path | None:
             raise ConfigError(f"{config.out}: can't resume with another {', '.join(changed)}")
     elif found is not None:
         raise ConfigError(f"{config.out} holds checkpoints without their config.json; choose another folder")
+    if found is not None and (done := int(found.name[-12:])) > config.steps:
+        raise ConfigError(f"{config.out}: {done} updates are done, more than steps ({config.steps})")
     return found
 
 
