@@ -37,9 +37,10 @@ def test_parts_are_functions_that_exist(program: Any) -> None:
         assert callable(getattr(owner, name)), path
 
 
-def test_all_agents_of_a_ring_step(program: Any) -> None:
+def test_all_agents_of_a_ring_step_and_segments_are_prepared(program: Any) -> None:
     work, steps = program("workloads").rings(2, 4, count=2, agents=3)
-    assert steps == 2 * 3
+    prepare, segments = program("workloads").preparation(1)
+    assert (steps, segments, prepare()) == (2 * 3, 1, None)
     after = work()["next", "agents"]
     assert after["valid"].all()
     assert after["state"].isfinite().all()
