@@ -98,7 +98,7 @@ def main() -> None:
     if given.fresh:
         agent = replace(agent, goals=goal_network(agent.spec))
     agent.goals.requires_grad_(True)
-    parts, shown = first_states(agent, given.data), {d.name: first_states(agent, d) for d in given.validation}
+    parts, shown = first_states(agent, given.data), {str(d): first_states(agent, d) for d in given.validation}
     updates = -(-len(parts) // given.segments)
     optimizer = torch.optim.AdamW(agent.goals.parameters(), weight_decay=given.decay)
     rates, loss = cosine({"goals": given.rate}, given.passes * updates), GoalLoss(agent.goals)

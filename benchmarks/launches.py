@@ -8,6 +8,7 @@ program counts as one.
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import sys
 from collections import Counter
@@ -180,6 +181,7 @@ def of_an_update(method: str, *, compile_step: bool = False) -> Counter[str]:
 
 def main() -> None:
     """Print the counts."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     for compile_step in (False, True):
         step, how = of_a_search_step(compile_step=compile_step), " (compiled)" * compile_step
         print(f"a step of a search{how}: {told(step)}", flush=True)

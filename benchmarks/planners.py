@@ -6,8 +6,10 @@ docs/torchrl.md.
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -121,8 +123,9 @@ def measured(name: str, kind: str) -> list[float]:
     return [float(torch.stack(returns).mean()), float(torch.stack(returns).std()) / SEEDS**0.5]
 
 
-def main() -> None:
+def main(args: Sequence[str] | None = None) -> None:
     """Print each planner's return in each environment, and write the record."""
+    argparse.ArgumentParser(description=__doc__).parse_args(args)
     rows: list[list[Any]] = [[kind] for kind in KINDS]
     for name in MAKERS:
         for row in rows:

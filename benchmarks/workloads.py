@@ -223,7 +223,7 @@ def preparation(segments: int = 64) -> Work:
     store = SegmentStore(builtin_store("train"))
 
     def once() -> None:
-        data, items = SceneDataset(store, 2, routes=True, num_points=200), list(range(segments))
+        data, items = SceneDataset(store, 2, routes=True), list(range(segments))
         data.scenes(items)
         data.experts.many(items)
 

@@ -37,9 +37,10 @@ def test_parts_are_functions_that_exist(program: Any) -> None:
         assert callable(getattr(owner, name)), path
 
 
-def test_all_agents_of_a_ring_step(program: Any) -> None:
+def test_all_agents_of_a_ring_step_and_segments_are_prepared(program: Any) -> None:
     work, steps = program("workloads").rings(2, 4, count=2, agents=3)
-    assert steps == 2 * 3
+    prepare, segments = program("workloads").preparation(1)
+    assert (steps, segments, prepare()) == (2 * 3, 1, None)
     after = work()["next", "agents"]
     assert after["valid"].all()
     assert after["state"].isfinite().all()
@@ -126,12 +127,22 @@ def test_planners_are_recorded(program: Any, tmp_path: Path, monkeypatch: Any) -
     small |= {"STEPS": dict.fromkeys(planners.MAKERS, 3)}
     for name, value in (small | {"RECORD": tmp_path / "a.json"}).items():
         monkeypatch.setattr(planners, name, value)
-    planners.main()
+    with pytest.raises(SystemExit):
+        planners.main(["--help"])  # measures nothing
+    planners.main([])
     record = json.loads((tmp_path / "a.json").read_bytes())
     assert [len(row) for row in record["rows"]] == [len(record["columns"])] * 5
     pole = [row[-1][0] for row in record["rows"]]
     assert max(pole) <= 3
     assert pole[0] < min(pole[1:])
+
+
+def test_goals_are_chosen_by_all_stores_also_where_they_are_called_alike(program, tmp_path, monkeypatch, capsys):
+    stores = [brief(tmp_path / name / "validation", [0], 16) for name in "ab"]
+    words = f"goals.py pretrained:bc_ts_h {tmp_path}/out --passes 1 --data {stores[0]} --validation"
+    monkeypatch.setattr("sys.argv", [*words.split(), *map(str, stores)])
+    program("goals").main()
+    assert capsys.readouterr().out.count('"draws"') == 2
 
 
 def test_an_average_is_the_mean_of_the_checkpoints(program: Any, tmp_path: Path) -> None:

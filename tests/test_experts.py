@@ -73,15 +73,9 @@ def test_experts_drive_or_wait_in_a_lane_and_are_not_parked() -> None:
     assert found.agent.tolist() == [0, 1, 3]
     assert found.error.max() < 0.15
     assert (found.actions[1] == 73).all()  # who waits neither steers nor brakes
-
-
-@pytest.mark.parametrize("split", ["train", "test"])
-def test_the_fit_of_the_built_in_set_ends_near_the_log(split: str) -> None:
-    store = SegmentStore(builtin_store(split))
-    found = fit_experts([store[item] for item in range(0, len(store), 3)], Bicycle())
-    errors = torch.cat([experts.error for experts in found])
-    assert len(errors) > 100
-    assert errors.mean() < 0.15
+    # The ego always, whoever else has no two steps in a row never.
+    once = hide(segment.replace(position=position, velocity=velocity, ego=2), 3, slice(1, None))
+    assert fit_experts([once], Bicycle())[0].agent.tolist() == [0, 1, 2]
 
 
 @settings(max_examples=25)
@@ -132,11 +126,12 @@ def data(store: Path, dynamics: Any = None, **how: Any) -> SceneDataset:
 
 
 def same(a: Experts, b: Experts) -> None:
-    for name in ("agent", "states", "actions", "valid", "error"):
+    for name in ("agent", "states", "actions", "valid", "error", "progress"):
         torch.testing.assert_close(getattr(a, name), getattr(b, name), rtol=0, atol=0, msg=name)
     for one, other in zip(a.routes, b.routes, strict=True):
         for name in ("points", "count", "right", "change", "logged"):
             assert np.array_equal(getattr(one, name), getattr(other, name)), name
+        np.testing.assert_equal(one.carried, other.carried)
 
 
 @DYNAMICS
@@ -168,9 +163,8 @@ def test_training_finds_all_that_was_prepared_by_whatever_workers(method, tmp_pa
 
 
 def test_another_action_space_or_duration_is_kept_apart(store: Path) -> None:
-    for dynamics, how in ((None, {}), (Bicycle(num_acceleration=21), {}), (None, {"duration": 5})):
-        data(store, dynamics, **how).experts(0)
-    data(store, routes=True).experts(0)
+    for how in ({}, {"dynamics": Bicycle(num_acceleration=21)}, {"duration": 5}, {"routes": True}):
+        data(store, **how).experts(0)
     assert len(files(store)) == 4
 
 
@@ -245,6 +239,12 @@ def test_it_leads_back(speed: float, by: tuple[float, ...]) -> None:
         state = way_back(state, log[t : t + 1], log[t + 1 : t + 2], LENGTH, DT)
     assert (state[0, :2] - log[-1, :2]).norm() < 0.2
     assert abs(float(state[0, 3] - log[-1, 3])) < 0.1
+    # From afar neither harder nor in a tighter bend than a vehicle can.
+    log = drive(5.0, 0.0, 0.0, 1)
+    state = log[:1] + torch.tensor([-20.0, 0.0, 1.0, 0.0])
+    most = (torch.tensor([value]) for value in (perturbation.BRAKING, -perturbation.STEERING))
+    far = way_back(state, log[:1], log[1:], LENGTH, DT)
+    torch.testing.assert_close(far, bicycle_step(state, *most, LENGTH, DT))
 
 
 @given(
@@ -266,13 +266,13 @@ def test_a_label_brakes_and_turns_as_the_way_back_does(speed, acceleration, late
         assert wrap(found[:, 2] - log[1:, 2]).abs() < 0.01
 
 
-def test_slow_vehicles_are_not_put_sideways_and_none_goes_backwards() -> None:
-    rng = torch.Generator().manual_seed(0)
-    standing = torch.zeros(500, 4)
-    found = displaced(standing, rng)
-    assert (found[:, 1:3] == 0).all()
-    assert (found[:, 3] >= 0).all()
-    assert (found[:, 3] > 0).any()
+def test_displacements_are_as_large_as_is_said_and_none_goes_backwards() -> None:
+    """A slow vehicle is not put sideways, a fast one hardly; all times a number that is uniform from 0 to 1."""
+    for speed, across, turned in ((0.0, 0.0, 0.0), (2.0, 0.5, 0.5), (8.0, 1.0, 1.0), (32.0, 1.0, 0.25)):
+        found = displaced(torch.tensor([0.0, 0.0, 0.0, speed]).expand(20_000, 4), torch.Generator().manual_seed(0))
+        most = torch.tensor([perturbation.AHEAD, perturbation.ASIDE * across, perturbation.TURNED * turned])
+        torch.testing.assert_close(found[:, :3].std(0), most / 3**0.5, atol=0, rtol=0.03)
+        assert (found[:, 3] >= 0).all()
 
 
 def test_a_share_is_displaced_and_the_rest_left_as_it_was() -> None:
@@ -280,19 +280,22 @@ def test_a_share_is_displaced_and_the_rest_left_as_it_was() -> None:
         log = drive(8.0, 0.3, 0.0, 1).float()
         state = log[:1].expand(4000, 4) + 0.01
         action = torch.zeros(4000, dtype=torch.int64) if dynamics.discrete else torch.zeros(4000, 2)
-        given_ = (log[:1].expand(4000, 4), log[1:].expand(4000, 4), torch.tensor([4.5, 2.0]).expand(4000, 2))
-        rng = torch.Generator().manual_seed(1)
-        start, label = perturbed(state, action, *given_, dynamics, DT, 0.25, rng)
+        more = torch.linspace(1, 2, 4000)[:, None]  # no two are alike
+        given_ = (log[:1] * more, log[1:] * more, torch.tensor([4.5, 2.0]) * more)
+        start, label = perturbed(state, action, *given_, dynamics, DT, 0.25, torch.Generator().manual_seed(1))
         same = (start == state).all(-1)
         assert 0.7 < same.float().mean() < 0.8
         assert (label[same] == action[same]).all()
-        assert label.dtype == action.dtype
+        before, after, size = (each[~same] for each in given_)
+        back = dynamics.towards(start[~same], way_back(start[~same], before, after, size[:, 0], DT), size, DT)
+        torch.testing.assert_close(label[~same], back.to(action.dtype))
 
 
 def test_training_batches_are_the_log_unless_displaced(monkeypatch: pytest.MonkeyPatch) -> None:
     store = SegmentStore(builtin_store("train"))
     data = SceneDataset(store, 2, Bicycle(num_acceleration=21), routes=True)
     sees = ObservationConfig(num_points=16)
+    assert torch.cat([data.experts(k).error for k in range(0, len(store), 3)]).mean() < 0.15
 
     def batch(perturb: PerturbConfig | None) -> tuple[Tensor, Tensor]:
         rng = torch.Generator().manual_seed(3)

@@ -189,6 +189,24 @@ def test_what_is_searched_is_what_is_imitated(store: Path, tmp_path: Path) -> No
     assert torch.equal(stepped[keys.GOAL], after[keys.GOAL])
 
 
+def test_the_discriminator_is_shown_what_was_simulated_and_what_was_logged(store: Path, tmp_path: Path) -> None:
+    """After the first state, which is the same in both, up to the end of each scene."""
+    _, replay = searched(store, tmp_path, search=SearchConfig(branches=4, prune_every=4, updates=2, states=200))
+    env, tree, both = replay.env, replay.leaves["tree"], replay.both_kinds(torch.Generator().manual_seed(0))
+    assert torch.equal(both[keys.SIMULATED], (torch.arange(400) < 200)[:, None].expand(-1, 2))
+    after = led_to(tree)[(tree[keys.STEP] < env.scenes.last_step[tree[keys.SCENE]]).squeeze(-1)]
+    names = (keys.SCENE, keys.STEP, keys.STREAM, keys.VALID, keys.STATE, keys.GOAL, keys.PROGRESS)
+    same = [(both[name][:200, None] == after[name]).flatten(2).all(-1) for name in names]
+    assert torch.stack(same).all(0).any(1).all()
+    real, fit = both[200:], replay.data.fitted(env.scenes.segment.tolist(), env.scenes)
+    at = real[keys.SCENE].squeeze(-1), real[keys.STEP].squeeze(-1)
+    for name, expected in ((keys.STATE, fit.state), (keys.VALID, fit.valid), (keys.PROGRESS, fit.progress)):
+        assert torch.equal(real[name], expected[at])
+    assert torch.equal(real[keys.GOAL], env.scenes.route_logged[at[0]])
+    seen = torch.zeros_like(fit.valid[..., 0]).index_put(at, torch.tensor(True))
+    assert torch.equal(seen[:, 1:], fit.valid[:, 1:].any(-1))
+
+
 @pytest.mark.parametrize("method", ["bc_rl", "bc_rl_h"])
 def test_blame_is_what_came_of_an_action_beyond_the_mean_of_the_other_branches(method, store, tmp_path):
     search = SearchConfig(branches=4, prune_every=4, updates=2, states=8, rule="replace", goals="branch")
@@ -198,23 +216,16 @@ def test_blame_is_what_came_of_an_action_beyond_the_mean_of_the_other_branches(m
     trainer._update(0)
     replay = pieces(trainer)["replay"]
     env, leaves = replay.env, replay.leaves.clone()
-    rng = np.random.default_rng(0)
+    rng = torch.Generator().manual_seed(0)
     for key in (keys.COLLISION, keys.OFFROAD):  # of one sort or another, not what happens to be
-        bad = rng.random(leaves["next", key].shape) < 0.2
-        leaves["next", key] = torch.from_numpy(bad)
+        leaves["next", key] = torch.rand(leaves["next", key].shape, generator=rng) < 0.2
     found, fade = advantages(env, leaves), math.exp(-env.dt / MEMORY)
     there = leaves[keys.VALID] & (leaves[keys.STEP] < env.scenes.last_step[leaves[keys.SCENE]])
-    to_go, counts = np.zeros(found.shape), np.zeros(found.shape, bool)
-    for b, s, n in np.ndindex(found.shape[0], 4, found.shape[-1]):
-        for first in range(found.shape[2]):
-            for t in range(first, found.shape[2]):
-                if there[b, s, t, n]:
-                    hit, off = (leaves["next", k][b, s, t, n, 0].item() for k in (keys.COLLISION, keys.OFFROAD))
-                    to_go[b, s, first, n] -= fade ** (t - first) * (COLLIDED * hit + OFF_ROAD * env.dt * off)
-                    if hit:
-                        break
-        hits = leaves["next", keys.COLLISION][b, s, :, n, 0] & there[b, s, :, n]
-        counts[b, s, :, n] = (there[b, s, :, n] & (hits.cumsum(0) - hits.long() == 0)).numpy()
+    hit, off = (leaves["next", key].squeeze(-1) & there for key in (keys.COLLISION, keys.OFFROAD))
+    cost, to_go = COLLIDED * hit + OFF_ROAD * env.dt * off, [torch.zeros(hit[:, :, 0].shape)]
+    for t in reversed(range(hit.shape[2])):
+        to_go.insert(0, fade * to_go[0] * ~hit[:, :, t] - cost[:, :, t])
+    to_go, counts = torch.stack(to_go[:-1], 2).numpy(), (there & (hit.cumsum(2) - hit.long() == 0)).numpy()
     for b, s, t, n in np.ndindex(found.shape):
         others = [k for k in range(4) if k != s and counts[b, k, t, n]]
         mean = np.mean(to_go[b, others, t, n]) if others else to_go[b, s, t, n]

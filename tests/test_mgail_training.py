@@ -105,7 +105,7 @@ def test_the_gradient_goes_along_what_survived(store: Path, tmp_path: Path, meth
     replay.refresh(4)
     env, found = replay.env, replay.leaves
     assert found.shape[:2] == (2, 2)
-    begin = replay.repeatable(99, torch.Generator().manual_seed(0))
+    begin = replay.repeatable(99, torch.Generator().manual_seed(1))  # which mixes scenes
     assert begin.shape == (4,)
     paths, now, states = found.flatten(0, 1), begin.exclude("noise_plan"), []
     with torch.no_grad():

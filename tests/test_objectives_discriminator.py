@@ -83,7 +83,6 @@ def test_a_kind_that_is_absent_adds_nothing():
     assert all(out[key].isnan() for key in ("accuracy_data", "score_data", "auc"))
     assert out["accuracy_simulated"].isfinite()
     td[VALID] = torch.zeros_like(td[VALID])
-    network = discriminator()
     loss = DiscriminatorLoss(network, **PENALTY)(td)["loss_discriminator"]
     assert loss == 0
     loss.backward()
@@ -106,27 +105,21 @@ def test_it_keeps_the_contract_of_torchrl(arguments):
 @pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
 def test_the_penalty_of_a_linear_discriminator_is_its_weight(reduction):
     """The gradient of w . x is w wherever x is."""
-    td = batch(20)
-    net = nn.Linear(4, 1)
-    network = discriminator(net)
-    arguments = {"reduction": reduction}
-    out = DiscriminatorLoss(network, gradient_penalty=0.5, **arguments)(td)
-    plain = DiscriminatorLoss(network, **arguments)(td)
-    squared = net.weight.square().sum()
+    td, net = batch(20), nn.Linear(4, 1)
+    losses = (DiscriminatorLoss(discriminator(net), gradient_penalty=by, reduction=reduction) for by in (0.5, 0.0))
+    out, plain = (loss(td) for loss in losses)
+    squared, where = net.weight.square().sum(), td[VALID] & ~td[SIMULATED]
     torch.testing.assert_close(out["gradient_penalty"], squared.detach())
-    where = td[VALID] & ~td[SIMULATED]
-    added = {"mean": 1.0, "sum": where.sum(), "none": where.float()}[reduction] * 0.5 * squared
+    added = {"mean": torch.tensor(1.0), "sum": where.sum(), "none": where.float()}[reduction]
     difference = out["loss_discriminator"] - plain["loss_discriminator"]
-    torch.testing.assert_close(difference, added)
+    torch.testing.assert_close(difference, added * 0.5 * squared)
     # d (0.5 * |w|^2) / dw = w
     (gradient,) = torch.autograd.grad(difference.sum(), net.weight)
-    share = {"mean": 1.0, "sum": where.sum(), "none": where.sum()}[reduction]
-    torch.testing.assert_close(gradient, share * net.weight)
+    torch.testing.assert_close(gradient, added.sum() * net.weight)
 
 
 def test_bad_inputs_are_refused():
-    td = batch(5)
-    loss = DiscriminatorLoss(discriminator())
+    td, loss = batch(5), DiscriminatorLoss(discriminator())
     with pytest.raises(KeyError, match="no flag under"):
         loss(td.exclude(SIMULATED))
     wrong = td.clone().set(SIMULATED, td[SIMULATED].float())

@@ -130,8 +130,7 @@ def test_it_keeps_the_contract_of_torchrl():
 
 
 def test_bad_inputs_are_refused():
-    loss = GoalLoss(goal_network())
-    td = batch(5)
+    loss, td = GoalLoss(goal_network()), batch(5)
     td[VALID][2, 1], td[MASK][2, 1, 3], td[MASK][2, 1, 0] = True, False, True
     for label in (3, 6):
         td[LABEL][2, 1] = label
