@@ -481,7 +481,8 @@ def test_only_lanes_for_cars_count_on_either_side_of_the_road(tmp_path: Path, mo
     grid = "--grid --grid.number 3 --grid.length 120 --default.lanenumber 2 --sidewalks.guess true"
     run_program("netgenerate", f"{grid} --output-file g.net.xml --{more}", tmp_path)
     file = tmp_path / "g.net.xml"
-    file.write_text(file.read_text().replace('disallow="pedestrian', 'disallow="truck bus pedestrian'))
+    text = file.read_text().replace('disallow="pedestrian', 'disallow="truck bus pedestrian')
+    file.write_text(text.replace('from="A0A1" to="A1', 'disallow="passenger" from="A0A1" to="A1', 1))  # a turn
     assert generate(Plan(1, kinds=(str(file),)), tmp_path / "store").complete
     (segment,) = SegmentStore(tmp_path / "store")
     assert segment.road.lane_width == pytest.approx(3.2)

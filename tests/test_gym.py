@@ -154,10 +154,12 @@ def test_segments_are_drawn_by_seed_and_only_those_with_an_ego(store):
         env.reset(options={"segment": "straight-5"})
     with pytest.raises(DataError, match="no such segment"):
         env.reset(options={"segment": "nowhere"})
-    env = gymnasium.make(NAME, data=store, observation=SMALL, duration=1)
-    env.reset(options={"segment": 1})
-    ends = [env.step(env.action_space.n // 2)[3] for _ in range(5)]
-    assert ends == [False] * 4 + [True]
+    for seconds, steps in ((1, 5), (0.01, 1)):
+        env = gymnasium.make(NAME, data=store, observation=SMALL, duration=seconds)
+        env.reset(options={"segment": 1})
+        ends = [env.step(env.action_space.n // 2)[3] for _ in range(steps)]
+        assert ends == [False] * (steps - 1) + [True]
+        assert env.unwrapped.seen().step == steps
 
 
 def test_the_extra_is_named_where_it_is_missing():

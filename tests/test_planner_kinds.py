@@ -178,17 +178,18 @@ def test_a_process_gets_a_small_environment(store, tmp_path, monkeypatch):
     assert all(name.startswith("PYTHON") for name in others), others
 
 
-@pytest.mark.parametrize("how", ["busy", "sleeping", "stubborn"])
+@pytest.mark.parametrize("how", ["busy", "sleeping", "stubborn", "deaf"])
 def test_one_that_takes_too_long_fails_its_run(store: Path, tmp_path: Path, how: str) -> None:
     def slow(observation: Observation) -> tuple[float, float]:
         while observation.step == 3:
             try:
                 if how != "busy":
                     time.sleep(60)
-            except Exception:
-                if how == "stubborn":
-                    continue
-                raise
+            except BaseException as error:
+                if how == "deaf":
+                    break
+                if how != "stubborn" or not isinstance(error, Exception):
+                    raise
         return 0.0, 0.0
 
     for saved in alone(store, tmp_path / "sim", slow, planner_seconds=0.5):

@@ -67,8 +67,11 @@ def _at_most(seconds: float) -> Iterator[None]:
         yield
         return
 
+    rung = list[str]()
+
     def ring(number: int, frame: FrameType | None) -> None:
-        raise _Overdue("" if frame is None else f" ({Path(frame.f_code.co_filename).name}:{frame.f_lineno})")
+        rung.append("" if frame is None else f" ({Path(frame.f_code.co_filename).name}:{frame.f_lineno})")
+        raise _Overdue(rung[0])
 
     before = signal.signal(signal.SIGALRM, ring)
     signal.setitimer(signal.ITIMER_REAL, seconds)
@@ -77,3 +80,5 @@ def _at_most(seconds: float) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
+    if rung:  # of a planner that catches everything
+        raise _Overdue(rung[0])

@@ -48,7 +48,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         observation: what the ego observes.
         reward: of a step, by states before and after it, as for ``DrivingEnv``; default -1 in collision or off road.
         ends_on: what ends an episode early.
-        duration: seconds of each segment that are driven; 0 for all.
+        duration: seconds of each segment that are driven, a step at least; 0 for all.
 
     ``reset(options={"segment": ID})`` starts a certain segment, by id or number; else one is drawn, of those whose
     ego is seen at the first step.
@@ -106,9 +106,8 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         super().reset(seed=seed)
         wanted = (options or {}).get("segment")
         if wanted is None:
-            number = int(self.np_random.integers(len(self.store)))
-            while not self._usable(number):
-                number = int(self.np_random.integers(len(self.store)))
+            drawn = iter(lambda: int(self.np_random.integers(len(self.store))), -1)
+            number = next(filter(self._usable, drawn))
         else:
             named = wanted if isinstance(wanted, str) else _whole(wanted)
             if named is None:
@@ -171,7 +170,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         """Start a segment of the store."""
         segment = self.store[number]
         if self.duration:
-            steps = round(self.duration / segment.dt) + 1
+            steps = max(round(self.duration / segment.dt), 1) + 1
             timed = ("position", "heading", "velocity", "valid", "signal_state")
             segment = segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})
         self._scene = scene(segment, [segment.ego], LaneGraph(segment.road), number=number)

@@ -62,8 +62,7 @@ def mcap(saved: SavedRollouts, rollout: int) -> bytes:
     ground = np.zeros(hit.shape) if world.height is None else np.nan_to_num(world.height[..., 0])
     place = np.concatenate([world.position, ground[..., None]], -1)
     for step in range(saved.steps + 1):
-        seconds, nanos = divmod(round(step * segment.dt * 1e9), 10**9)
-        stamp = {"seconds": seconds, "nanos": nanos}
+        stamp = dict(zip(("seconds", "nanos"), divmod(round(step * segment.dt * 1e9), 10**9), strict=True))
         about, entities = {"frame_id": "segment", "timestamp": stamp}, []
         for row in np.flatnonzero(world.valid[:, step]).tolist():
             cube = _solid(place[row, step] + [0, 0, size[row, 2] / 2], size[row], color[row])
@@ -77,8 +76,7 @@ def mcap(saved: SavedRollouts, rollout: int) -> bytes:
         write("/traffic", step, deletions=[{"timestamp": stamp, "type": "ALL"}], entities=entities)
         frames = [_transform("source", "segment", segment.origin, 0.0)]
         if world.valid[segment.ego, step]:
-            heading = world.heading[segment.ego, step]
-            frames.append(_transform("segment", "ego", place[segment.ego, step], heading))
+            frames.append(_transform("segment", "ego", place[segment.ego, step], world.heading[segment.ego, step]))
         write("/tf", step, transforms=[frame | {"timestamp": stamp} for frame in frames])
     writer.finish()
     return file.getvalue()

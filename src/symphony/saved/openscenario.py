@@ -103,9 +103,8 @@ def _teleport(pose: ET.Element) -> ET.Element:
 
 
 def _visible(shown: bool) -> ET.Element:
-    flag = "true" if shown else "false"
-    action = _node("VisibilityAction", graphics=flag, sensors=flag, traffic=flag)
-    return _node("PrivateAction", action)
+    flags = dict.fromkeys(("graphics", "sensors", "traffic"), str(shown).lower())
+    return _node("PrivateAction", _node("VisibilityAction", **flags))
 
 
 def _follow(vertices: list[ET.Element]) -> ET.Element:

@@ -119,9 +119,9 @@ def read_network(file: Path) -> Network:
     connectors: dict[str, list[tuple[int, int, int]]] = {}
     for link in root.iter("connection"):
         start, end = (index.get(f"{link.attrib[which]}_{link.attrib[f'{which}Lane']}") for which in ("from", "to"))
-        if start is None or end is None:  # crossings, or lanes for others than cars
+        via = index.get(link.attrib["via"]) if "via" in link.attrib else end
+        if start is None or end is None or via is None:  # crossings, or lanes and turns for others than cars
             continue
-        via = index[link.attrib["via"]] if "via" in link.attrib else end
         successors.add((start, via))
         if "tl" in link.attrib:
             connectors.setdefault(link.attrib["tl"], []).append((int(link.attrib["linkIndex"]), via, start))

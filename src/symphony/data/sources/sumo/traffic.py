@@ -176,8 +176,7 @@ def simulate_traffic(
     velocity = np.gradient(position, STEP, axis=1)
     # At both ends of a track the difference is with an absent neighbour.
     present = np.asarray(np.isfinite(velocity).all(axis=-1))
-    files = ((light, folder / f"lights{k}.xml") for k, light in enumerate(network.connectors))
-    lights = {light: _read_lights(file, time) for light, file in files}
+    lights = {light: _read_lights(folder / f"lights{k}.xml", time) for k, light in enumerate(network.connectors)}
     return Traffic(size, position, heading, velocity, present, lights)
 
 
