@@ -106,8 +106,9 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         super().reset(seed=seed)
         wanted = (options or {}).get("segment")
         if wanted is None:
-            drawn = iter(lambda: int(self.np_random.integers(len(self.store))), -1)
-            number = next(filter(self._usable, drawn))
+            number = int(self.np_random.integers(len(self.store)))
+            while not self._usable(number):
+                number = int(self.np_random.integers(len(self.store)))
         else:
             named = wanted if isinstance(wanted, str) else _whole(wanted)
             if named is None:

@@ -62,7 +62,8 @@ def mcap(saved: SavedRollouts, rollout: int) -> bytes:
     ground = np.zeros(hit.shape) if world.height is None else np.nan_to_num(world.height[..., 0])
     place = np.concatenate([world.position, ground[..., None]], -1)
     for step in range(saved.steps + 1):
-        stamp = dict(zip(("seconds", "nanos"), divmod(round(step * segment.dt * 1e9), 10**9), strict=True))
+        seconds, nanos = divmod(round(step * segment.dt * 1e9), 10**9)
+        stamp = {"seconds": seconds, "nanos": nanos}
         about, entities = {"frame_id": "segment", "timestamp": stamp}, []
         for row in np.flatnonzero(world.valid[:, step]).tolist():
             cube = _solid(place[row, step] + [0, 0, size[row, 2] / 2], size[row], color[row])
