@@ -51,7 +51,7 @@ class Contacts(NamedTuple):
     other: Indices  # row of A
     step: Indices  # the state after it, from 1
     share: Reals  # of the step before that state after which they first overlap, from 0 to 1
-    kind: Indices  # a CollisionKind, from the agent's point of view
+    kind: Indices  # a CollisionKind, from the agent's point of view, but by motion alone: of people and cyclists, too
     at_state: Bools  # whether they overlap at any state, not only between two
 
 

@@ -21,7 +21,7 @@ Angles = Float[Tensor, "*#batch"]
 Reals = Float[Tensor, "*batch"]
 
 _TURNED = 0.005
-"""Metres that a corner may move by turning in one part of a step; in each part headings stay as they are."""
+"""Metres by which a corner may be out of place: in each part of a step headings stay as in its middle."""
 _MOST_PARTS = 64
 _SLOW = 1e-9
 
