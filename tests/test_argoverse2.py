@@ -91,9 +91,6 @@ def test_the_boundary_is_open_where_the_map_is_cut(tmp_path: Path) -> None:
     assert (off_road(segment.road, spots) > 0).tolist() == [False] * 5 + [True] * 3
 
 
-# Bad input
-
-
 @IN_FOLDER
 @given(data=st.data())
 def test_either_file_cut_anywhere(data: st.DataObject, tmp_path: Path) -> None:

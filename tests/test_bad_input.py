@@ -69,9 +69,6 @@ def test_things_that_are_no_files_of_the_format(name: str, tmp_path: Path) -> No
         assert message in error.message
 
 
-# WOMD
-
-
 @pytest.fixture
 def shard(tmp_path: Path) -> bytes:
     """Three small records."""
@@ -115,9 +112,6 @@ def test_a_huge_length_is_not_allocated(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(head + struct.pack("<I", masked_crc32c(head)) + b"abc\0\0\0\0")
     assert "cut short" in read_error("womd", path).message
-
-
-# CommonRoad
 
 
 def laughs() -> str:

@@ -15,10 +15,11 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from helpers_saved import played
 from helpers_segments import straight_road
 from helpers_store import brief
 from symphony import keys
-from symphony.bench.rare import Rate, leaf_weights, remarks, resampling
+from symphony.bench.rare import Rate, _kept, _rate, leaf_weights, remarks, resampling
 from symphony.cli import main
 from symphony.collectors import Systematic, beam_search, branch
 from symphony.data.builtin import builtin_store
@@ -107,7 +108,7 @@ def test_near_is_whoever_is_ahead_and_a_hit_is_remembered() -> None:
         start.set("hit", torch.full((1, 1), hit))
         return float(lure.near(start))
 
-    assert near(1.0, 20.0) > near(4.0, 20.0) > near(4.0, 0.0) > 0
+    assert near(1.0, 20.0) > near(4.0, 20.0) > near(15.0, 20.0) > near(4.0, 0.0) > 0
     assert near(300.0, 0.0) == 0
     assert near(300.0, 0.0, behind=0.5) == 0
     # Who merges from beside counts, with its centre behind the ego's or not.
@@ -115,6 +116,9 @@ def test_near_is_whoever_is_ahead_and_a_hit_is_remembered() -> None:
     assert near(300.0, 0.0, behind=9.0, aside=2.5) == 0
     assert near(-1.0, 5.0) == 1
     assert near(300.0, 0.0, hit=1.0) == 1
+    at, height = env.objects, torch.tensor([[[0.0, 1], [6, 2], [0, 1]]])  # one is on a bridge
+    env.objects = lambda *state: at(*state)._replace(height=height)  # type: ignore[method-assign]
+    assert near(-1.0, 5.0) == 0 < near(-1.0, 5.0, behind=2.0, aside=2.5)
 
 
 def test_the_command_finds_the_rate_of_free_rollouts_and_keeps_what_shows_it(tmp_path, capsys):
@@ -157,6 +161,12 @@ def test_what_a_rate_is_worth_is_said():
     assert "take more branches" in said(1.1, 8)
     assert "bounds no rate" in said(0.0, 0)
     assert said(math.nan, 0) == ""
+    saved = played(straight_road(2, steps=4), rollouts=6)
+    saved.state[:, 0, 0, 0] = np.arange(6)
+    kept = _kept(saved, np.array([[False, False, True], [False, True, True]]))  # the first of each tree
+    found = _rate(kept, np.array([0.0, 0.3, 0.6]), "")
+    assert (kept.state[:, 0, 0, 0].tolist(), found.kept, found.trees) == ([2, 4], 2, 2)
+    assert (found.rate, found.error) == (pytest.approx(0.3), pytest.approx(0.3 / math.sqrt(3)))
 
 
 def test_a_hunt_says_no_zero_for_what_it_does_not_know(store, tmp_path, capsys):
@@ -173,8 +183,8 @@ def test_a_hunt_says_no_zero_for_what_it_does_not_know(store, tmp_path, capsys):
     code, _, error = told(fails, "0", "all")
     assert code == 3
     assert re.search(r"failed in 8 of 8 runs, the first: .*flat tyre.*metric failed_rate", error)
-    found = json.loads(told(fails, "0", "failed", "--metric", "failed_rate", "--json", "-")[1])
-    assert [one["rate"] for one in found] == [pytest.approx(1.0, abs=0.5)] * 2
+    found = json.loads(told(fails, "0 1", "failed", "--metric", "failed_rate", "--json", "-")[1])
+    assert [one["rate"] for one in found] == [pytest.approx(1.0, abs=0.5), 0.0, found[0]["rate"] / 2]
     # Where it fails in one segment, the others have their rates; the same hunt finds the same once more.
     for _ in range(2):
         code, text, error = told(fails, "0 1", "one", "--metric", "collision_rate", "--json", "-")

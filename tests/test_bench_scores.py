@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from helpers_saved import played
-from helpers_segments import crossing, make_segment, straight_road
+from helpers_segments import crossing, hide, make_segment, straight_road
 from helpers_store import fill
 from symphony.bench.criticality import GENTLE, HARD, LONGEST, criticality, hardest
 from symphony.bench.published import PDM, comfortable, derivative, pdm
@@ -87,15 +87,21 @@ def two(ego: Any, other: Any, *, dt: float = 0.2, steps: int = 21) -> RunSegment
 
 
 @pytest.mark.parametrize("dt", [0.1, 0.2])
-def test_another_that_crosses_behind_the_ego_comes_close_in_time(dt: float) -> None:
+def test_another_that_crosses_behind_the_ego_comes_close_in_time(dt: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The ego leaves the crossing at 4.5 / 2 + 1 m past it, the other comes there 2.25 m before it: 1 s later."""
     ego = lambda t: (-10 + 10 * t, 0.0, 0.0, 10.0)  # noqa: E731
     clears = (10 + 1 + 2.25) / 10
     other = lambda t: (0.0, -(clears + 1) * 10 - 1 - 2.25 + 10 * t, np.pi / 2, 10.0)  # noqa: E731
-    found = criticality(two(ego, other, dt=dt, steps=round(4 / dt) + 1))
+    meets = two(ego, other, dt=dt, steps=round(4 / dt) + 1)
+    found = criticality(meets)
     assert found.encroachment == pytest.approx(1.0, abs=dt + 1e-6)
     assert found.score >= 1 - (1.0 + dt) / LONGEST - 1e-6
     assert found.score <= 4
+    # At one time boxes overlap by mistake; on a bridge they do not meet.
+    assert criticality(two(ego, lambda t: (*ego(t)[1::-1], np.pi / 2, 10.0), dt=dt)).encroachment == pytest.approx(dt)
+    heights = np.tile(np.float32([[0, 1], [6, 2]]), (meets.num_steps, 1, 1))
+    monkeypatch.setattr("symphony.bench.criticality.agent_heights", lambda segment: heights)
+    assert criticality(meets).encroachment == math.inf
 
 
 def test_who_follows_in_a_lane_does_not_cross() -> None:
@@ -113,7 +119,7 @@ def test_time_to_collision_is_that_of_the_gap() -> None:
 @given(st.floats(0.0, 8.0))
 def test_braking_counts_from_gentle_to_hard(braking: float) -> None:
     ego = lambda t: (20 * t - braking * t * t / 2, 0.0, 0.0, 20 - braking * t)  # noqa: E731
-    found = criticality(two(ego, lambda t: (0.0, 500.0, 0.0, 0.0), steps=6))
+    found = criticality(hide(two(ego, lambda t: (0.0, 500.0, 0.0, 0.0), steps=6), 0, 3))
     assert found.braking == pytest.approx(braking, abs=0.01)
     assert found.score == pytest.approx(min(1, max(0, (braking - GENTLE) / (HARD - GENTLE))), abs=0.01)
 
@@ -138,7 +144,8 @@ def test_of_rollouts_the_hardest_are_named_by_segment_and_number(tmp_path: Path,
     segment = crossing(4, steps=30)
     one = played(segment, rollouts=3)
     one.state[1, 20:, 0, 3] -= 2.0  # within 0.2 s
-    one.collision[2, 9, 0] = True
+    one.collision[2, 9, 0] = one.collision[0, -1, 0] = True
+    one.counted[0, -1, 0] = False  # so it did not happen
     save_rollouts(tmp_path / "sim", About("made"), [one, played(straight_road(3, steps=8))])
     assert main(["data", "hardest", str(tmp_path / "sim"), "--count", "3", "--json", "-"]) == 0
     brakes, hits, log = sorted(json.loads(capsys.readouterr().out), key=lambda one: (one["rollout"] - 1) % 3)

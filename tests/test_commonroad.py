@@ -111,9 +111,6 @@ def test_the_ego_has_the_most_moving_neighbours(path: Path) -> None:
         assert len({content_hash(item) for item in alike}) == 1
 
 
-# Lanelets
-
-
 def test_lanes(path: Path) -> None:
     near = lanelet(12, [(0, 6), (50, 6)], [(0, 2), (50, 2)], '<adjacentRight ref="10" drivingDir="same"/>')
     opposite = '<adjacentLeft ref="10" drivingDir="opposite"/>'
@@ -219,8 +216,6 @@ def test_rings_bound_the_union(boxes: list[tuple[float, ...]]) -> None:
     assert union.difference(rebuilt.buffer(0.05)).area < 0.05
 
 
-# Lights
-
 CYCLE = "".join(
     f"<cycleElement><duration>{steps}</duration><color>{color}</color></cycleElement>"
     for steps, color in ((3, "green"), (1, "yellow"), (4, "red"))
@@ -266,9 +261,6 @@ def test_a_light_repeats_its_cycle_from_the_offset(path: Path, offset: int) -> N
 )
 def test_a_light_holds_for_its_directions(path: Path, direction: str, lanes: list[int]) -> None:
     assert convert(path, FORK, TURNS, light(0, direction), driver(7)).signal_lane.tolist() == lanes
-
-
-# Planning problems
 
 
 def problem(goal: str, number: int = 100, x: float = 5.0) -> str:

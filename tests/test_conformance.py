@@ -61,9 +61,6 @@ def test_samples_conform(name: str, pattern: str, count: int, samples: Path) -> 
     assert report.segments == count
 
 
-# Segments that break a promise
-
-
 def traffic() -> list[RunSegment]:
     """Good segments with turns, lights and neighbours."""
     return [crossing(), hide(straight_road(8), 2, slice(10, 20))]
@@ -156,9 +153,6 @@ BROKEN: dict[str, tuple[Callable[[RunSegment], RunSegment], set[str]]] = {
 def test_segments_that_break_a_promise(name: str) -> None:
     change, expected = BROKEN[name]
     assert set(failing(lambda: check_segments(list(map(change, traffic())))).failures) == expected
-
-
-# Readers that break a promise
 
 
 class LinesReader(Reader):

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -26,6 +27,7 @@ from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, Displacement, ObservationConfig
 from symphony.envs.dynamics import bicycle_step
+from symphony.envs.routes import FollowedRoutes
 from symphony.geometry import with_speed
 from symphony.geometry.frames import rotate, wrap
 from symphony.learning import SceneDataset, perturbation
@@ -294,7 +296,9 @@ def test_a_share_is_displaced_and_the_rest_left_as_it_was() -> None:
 def test_training_batches_are_the_log_unless_displaced(monkeypatch: pytest.MonkeyPatch) -> None:
     store = SegmentStore(builtin_store("train"))
     data = SceneDataset(store, 2, Bicycle(num_acceleration=21), routes=True)
-    sees = ObservationConfig(num_points=16)
+    sees, window, come = ObservationConfig(num_points=16, route=True), FollowedRoutes.window, []
+    seen = lambda routes, far: (come.append((routes.lines(), far[:, 0])), window(routes, far))[1]  # noqa: E731
+    monkeypatch.setattr(FollowedRoutes, "window", seen)
     assert torch.cat([data.experts(k).error for k in range(0, len(store), 3)]).mean() < 0.15
 
     def batch(perturb: PerturbConfig | None) -> tuple[Tensor, Tensor]:
@@ -311,5 +315,11 @@ def test_training_batches_are_the_log_unless_displaced(monkeypatch: pytest.Monke
     assert (plain[..., :2] - still[..., :2]).norm(dim=-1).median() < 0.1
     levels, _ = Bicycle(num_acceleration=21).grid(torch.zeros(1))
     assert (levels[action] - levels[label]).abs().median() < 0.3
+    monkeypatch.setattr(perturbation, "AHEAD", 6.0)
     away, _ = batch(PerturbConfig(share=1.0))
     assert (plain[..., :2] - away[..., :2]).norm(dim=-1).median() > 0.2
+    # As far along its route as where it is, some metres from where it was.
+    ((lines, count), far), (_, before) = come[-1], come[0]
+    for at, line, number, now, then in zip(away[:, 0, :2], lines[:, 0], count[:, 0], far, before, strict=True):
+        expected = shapely.LineString(line[:number]).project(shapely.Point(at)) if number > 1 else 0.0
+        assert abs(expected - then) > 6 or now == pytest.approx(expected, abs=0.5)

@@ -56,6 +56,9 @@ def test_openscenario_has_every_agent_where_it_was():
             assert steps == np.flatnonzero(world.valid[row]).tolist()
             shown = root.find(f".//Private[@entityRef='{name}']//VisibilityAction").get("traffic")
             assert (shown == "true") == world.valid[row, 0]
+            leaves = root.findall(f".//ManeuverGroup[@name='{name}']/Maneuver/Event")
+            gone = [float(one.get("name")[6:]) / 0.2 for one in leaves if one.get("name").startswith("leave ")]
+            np.testing.assert_allclose(gone, 1 + np.flatnonzero(np.diff(world.valid[row] + 0) < 0), atol=0.1)
             mine = np.array([states[step] for step in steps]) - [*segment.origin[:2], 0]
             logged = np.column_stack([world.position[row, steps], world.heading[row, steps]])
             np.testing.assert_allclose(mine, logged, atol=1e-3)

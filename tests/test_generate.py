@@ -288,9 +288,6 @@ def boxes(segment: RunSegment, step: int) -> NDArray[Any]:
     return shapely.polygons(segment.position[seen, step, None, :2] + corners)
 
 
-# Laws of all segments
-
-
 def test_segments_conform_and_keep_the_exclusions(driven: list[RunSegment]) -> None:
     """Schema, speeds, headings, lanes and the side of the boundary, and that vehicles are on the road."""
     report = check_segments(driven)

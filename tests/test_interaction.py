@@ -132,9 +132,6 @@ def test_lights_of_the_test_area(tmp_path: Path) -> None:
     np.testing.assert_allclose(without.position, segment.position, atol=1e-5)
 
 
-# Motion that does not fit
-
-
 def raw(x: float = 0, **options: float) -> list[str]:
     return [row for k in range(3) for row in track(k, x=x - 15 * k, **options)]
 
@@ -176,8 +173,6 @@ def test_states_logged_twice(tmp_path: Path) -> None:
     found = read_one("interaction", path, motion="positions")
     np.testing.assert_allclose(found.position[0, 7, :2] + found.origin[:2], (7.1, 2.05), atol=1e-4)
 
-
-# What is refused
 
 GOOD = text(CARS)
 

@@ -154,9 +154,6 @@ def test_what_a_map_lacks_is_left_out(content: str, kind: str, example: str, tmp
     assert not source.areas
 
 
-# Projections
-
-
 @pytest.mark.parametrize(("origin", "place", "by_utm", "by_mercator"), [
     ((0, 0), (0.0085, 0.0102), (1136.5711, 940.7946), (1135.4588, 946.2157)),
     ((49.01160993928274, 8.43856470258739), (49.0125, 8.4401), (112.9986, 98.1141), (112.0999, 99.0820)),

@@ -40,7 +40,8 @@ ROUTED = ObservationConfig(num_objects=4, num_points=12, route=True)
 
 
 LATE = hide(crossing(5, seed=1, steps=6), 3, slice(0, 4))  # one vehicle comes into sight after the start
-store = stored(lambda: [straight_road(4, steps=5), crossing(4, steps=7), LATE])
+GAP = hide(straight_road(4, steps=5), [1, 2, 3], 2)  # all but the ego are out of sight once
+store = stored(lambda: [GAP, crossing(4, steps=7), LATE])
 trained = trained_as(tiny)
 
 
@@ -277,8 +278,12 @@ def test_expert_batches_show_what_the_environment_shows_with_logged_goals(store:
 def test_goal_batches_are_the_choices_of_the_environment(store: Path) -> None:
     dataset = SceneDataset(SegmentStore(store), 2, Bicycle(), routes=True)
     for item in range(3):
-        env = DrivingEnv(dataset.scenes([item]), Bicycle(), ROUTED)
+        env, experts = DrivingEnv(dataset.scenes([item]), Bicycle(), ROUTED), dataset.experts(item)
         seen = env.choices(env.start(torch.tensor([0])))
+        one = {"points": np.float32([[0, 0]]), "count": [1], "right": [True], "change": np.float32([np.inf])}
+        more = [{name: np.append(getattr(each, name), one[name], 0) for name in one} for each in experts.routes]
+        tables = tuple(replace(each, **found) for each, found in zip(experts.routes, more, strict=True))
+        dataset.experts.kept[item] = replace(experts, routes=tables), 0
         batch = dataset.sample_goals([item], 60, ROUTED, torch.Generator().manual_seed(0))
         routes, mask, label = (batch[key][:, 0] for key in (keys.ROUTES, keys.ROUTES_MASK, keys.GOAL))
         assert batch[keys.VALID].all()
@@ -289,6 +294,9 @@ def test_goal_batches_are_the_choices_of_the_environment(store: Path) -> None:
             same &= (routes[:, : len(own)] - own).abs().amax((-1, -2)) < 1e-4
             assert same.any()
             assert (label[same] == env.scenes.route_logged[0, agent]).all()
+            table = tables[experts.agent.tolist().index(int(env.scenes.interactive[0, agent]))]
+            right = torch.tensor([*table.right[:-1], False])  # one point more is no choice
+            assert (batch[keys.GOAL_SET][same, 0, : len(right)] == right).all()
 
 
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])

@@ -38,16 +38,16 @@ def fixed(score, simulated, **arguments):
 
 
 def test_by_hand():
-    probability = torch.tensor([0.5, 0.8, 0.9, 0.2, 0.1, 0.6])
+    probability = torch.tensor([0.5, 0.8, 0.9, 0.2, 0.1, 0.5])  # one half decides for neither
     simulated = torch.tensor([True, True, True, True, False, False])
     out = fixed(probability.logit(), simulated)
     fake = torch.tensor([0.5, 0.8, 0.9, 0.2]).log().mean()
-    real = torch.tensor([0.9, 0.4]).log().mean()
+    real = torch.tensor([0.9, 0.5]).log().mean()
     torch.testing.assert_close(out["loss_discriminator"], -(fake + real) / 2)
     assert (out["accuracy_simulated"], out["accuracy_data"]) == (0.5, 0.5)
     torch.testing.assert_close(out["score_simulated"], probability[:4].logit().mean())
     torch.testing.assert_close(out["score_data"], probability[4:].logit().mean())
-    assert out["auc"] == 0.75
+    assert out["auc"] == 6.5 / 8
 
 
 @pytest.mark.parametrize("shape", [(40,), (8, 5)])

@@ -212,9 +212,9 @@ def test_of_a_trajectory_the_first_state_is_driven() -> None:
 def test_the_observation_is_all_in_si_units(store: Path, tmp_path: Path) -> None:
     seen: list[Observation] = []
 
-    def looks(observation: Observation) -> tuple[float, float]:
+    def looks(observation: Observation) -> Pose:
         seen.append(observation)
-        return 0.0, 0.0
+        return Pose(*observation.ego[:3], -1.0)
 
     by_segment = {saved.segment.segment_id: saved for saved in alone(store, tmp_path / "sim", looks)}
     assert {one.segment_id for one in seen} == set(by_segment)
@@ -242,9 +242,8 @@ def test_the_observation_is_all_in_si_units(store: Path, tmp_path: Path) -> None
 
 def test_bounds_and_neighbours_of_lanes() -> None:
     """Bounds lie half a width beside the centre line, by shapely, on its two sides; links are those of the map."""
-    segment = crossing(4, steps=11)
-    road = segment.road
-    for lost in (False, True):
+    for segment, lost in ((straight_road(3), False), (crossing(4), False), (crossing(4), True)):
+        road = segment.road
         width = np.where(lost & (np.arange(len(road.lanes)) == 0), np.nan, road.lane_width)
         known = segment.replace(road=dataclasses.replace(road, lane_width=width.astype(np.float32)))
         lanes = lanes_of(scenario_of(known, 0, np.zeros((0, 2)), np.zeros(4), 0))
@@ -400,9 +399,9 @@ def test_two_planners_each_see_the_scene_from_their_own_seat(search: Any, tmp_pa
 
 
 def test_planners_of_others_fail_by_their_name_and_what_can_not_be_is_told(store, tmp_path, capsys):
-    late = partial(FunctionPlanner, lambda seen: (0.0, 0.0) if seen.step < 3 else None)
+    late = lambda end: partial(FunctionPlanner, lambda seen: (0.0, 0.0) if seen.step < end else None)  # noqa: E731
     segment = crossing(4, steps=11)
-    saved = several(tmp_path, segment, "log", {(agent := int(segment.agent_id[1])): late})
+    saved = several(tmp_path, segment, late(5), {(agent := int(segment.agent_id[1])): late(3)})
     assert saved.failed[0].startswith(f"agent {agent}, step 3: ")
     assert saved.counted[0].sum(0).tolist() == [3, 3]
     words = f"simulate playback --data {tmp_path / 'store'} --duration 2 --out {tmp_path / 'out'} --planner"

@@ -296,6 +296,9 @@ def test_agents_that_are_lost_and_odd_ids_stay_apart(tmp_path):
     first, second = (again.valid[again.agent_id == number][0] for number in (8, 14))
     np.testing.assert_array_equal(first ^ second, segment.valid[2])
     assert AgentType.CYCLIST in again.agent_type
+    late = played(hide(segment, 3, 0), [3])  # present after the first step, not before
+    late.counted[:] = True
+    assert late.there[0, :, 0].tolist() == [False, *[True] * 20]
 
 
 def test_json_says_who_is_the_ego_and_where_it_was_to_go():
@@ -316,7 +319,7 @@ def test_json_says_who_is_the_ego_and_where_it_was_to_go():
 
 def test_the_command_writes_a_file_for_each_rollout(tmp_path, capsys):
     saved = played(crossing(4, steps=11), [0, 1], 3)
-    saved.collision[1, 4, 1] = True
+    saved.collision[1, [4, 9], [1, 0]], saved.counted[1, 9, 0] = True, False
     save_all(tmp_path / "sim", About("made"), [saved, played(straight_road())])
     sim, out = str(tmp_path / "sim"), tmp_path / "json"
     assert main(["export", sim]) == 0
@@ -330,7 +333,7 @@ def test_the_command_writes_a_file_for_each_rollout(tmp_path, capsys):
     np.testing.assert_array_equal(states[:, 0], np.arange(11))
     np.testing.assert_allclose(states[:, 1:3], world.position[1], atol=1e-6)
     np.testing.assert_allclose(states[:, 4], world.speed[1], atol=1e-6)
-    assert found["agents"][1]["collision"] == [5]
+    assert [agent["collision"] for agent in found["agents"][:2]] == [[], [5]]  # what does not count is not told
     assert [agent["driver"] for agent in found["agents"]] == ["made", "made", "playback", "playback"]
     assert found["lights"][0]["states"][0] == SignalState(saved.segment.signal_state[0, 0]).name.lower()
     assert main(["export", sim, "--rollouts", "1"]) == 1

@@ -162,9 +162,6 @@ def test_what_scenarionet_makes_of_nuplan(tmp_path: Path) -> None:
     np.testing.assert_allclose(segment.signal_point, [(40, 0, 0)])
 
 
-# What is refused
-
-
 def changed(path: str, value: Any) -> dict[str, Any]:
     """The scenario with another value, or with ``...`` none, under a path of keys."""
     tree = holder = scenario()

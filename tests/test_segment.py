@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from helpers_segments import random_segment, segments, straight_road
+from helpers_segments import hide, random_segment, segments, straight_road
 from symphony.data.odd import oddities
 from symphony.data.segment import Polylines, RunSegment, content_hash, line_lengths, validate
 from symphony.errors import DataError
@@ -172,7 +172,8 @@ def test_any_number_changes_the_hash(name: str) -> None:
 
 def test_odd_values_are_named() -> None:
     segment = straight_road(3, steps=8)
-    assert oddities(segment) == []
+    away = segment.replace(position=segment.position + np.float32(2000))
+    assert oddities(segment) == oddities(validate(hide(away, 1, slice(2, 4)))) == []
     fast = segment.replace(velocity=segment.velocity + np.float32(80))
     small = segment.replace(size=segment.size * np.float32(0.1))
     jumping = segment.replace(position=moved(segment.position, 100))

@@ -29,6 +29,7 @@ TURN_IN = np.asarray([(-100, 10), *zip(-10 + 10 * np.sin(ARC), 20 - 10 * np.cos(
 """From the west into NORTH, which it reaches at y = 20, 100.7 m on."""
 OFF = zip(10 * np.cos(ARC) - 10, 10 * np.sin(ARC) - 20, strict=True)
 TURN_OFF = np.asarray([(0, -200), *OFF, (-200, -10)])
+PULL_OUT = np.asarray([*zip(4 * np.sin(ARC[7:]) - 4, -4 * np.cos(ARC[7:]), strict=True), (0, 200)])
 CREEP = np.minimum(0.5 * TIME, 4)
 CHANGE_LANE = np.asarray([[3.5, -200], [3.5, -30], [0, 0], [0, 200]])
 
@@ -53,6 +54,7 @@ BY_CONTEXT: dict[Context, dict[str, Paths]] = {
         "turns in before": [(NORTH, north(-30)), (TURN_IN, 66.7 + 8 * TIME), (BESIDE, north(-28))],
         "turns in after": [(NORTH, north(-10)), (TURN_IN, 50.7 + 8 * TIME), (NORTH, north(-25))],
         "changes lane": [(NORTH, north(-60, 10)), (CHANGE_LANE, north(-42, 10)), (NORTH, north(-75, 10))],
+        "pulls out": [(NORTH, north(-30)), (PULL_OUT, 8 * TIME), (BESIDE, north(-28))],
         "ego changes": [(CHANGE_LANE, north(-42, 10)), (NORTH, north(-60, 10)), (BESIDE, north(-57, 10))],
     },
     Context.CROSSING: {
@@ -63,6 +65,7 @@ BY_CONTEXT: dict[Context, dict[str, Paths]] = {
         "leads": [(NORTH, north(-60)), (NORTH, north(-44)), (BESIDE, north(-58))],
         "leads and turns off": [(NORTH, north(-60)), (TURN_OFF, north(-44, 6)), (BESIDE, north(-58))],
         "leads around a corner": [(TURN_OFF, north(-45)), (TURN_OFF, north(-25)), (BESIDE, north(-43))],
+        "comes near": [(NORTH, north(-60, 10)), (NORTH, north(4.4, 6)), (BESIDE, north(-58))],
         "queue": [(NORTH, 180 + CREEP), (NORTH, 188 + 0.75 * CREEP), (BESIDE, north(-19, 0.5))],
     },
     Context.FOLLOWER: {
@@ -74,6 +77,7 @@ BY_CONTEXT: dict[Context, dict[str, Paths]] = {
         "head on": [(NORTH, north(-40)), (NORTH[::-1], north(0))],
         "oncoming": [(NORTH, north(-40)), (ONCOMING, north(0))],
         "crosses long before": [(NORTH, north(-60)), (EAST, north(-8))],
+        "comes near too late": [(NORTH, north(-60, 10)), (NORTH, north(7.6, 6))],
         "far ahead": [(NORTH, north(-60)), (NORTH, north(-20))],
     },
 }
@@ -98,7 +102,7 @@ def test_frame_and_order_do_not_matter(case: str, angle: float, shift: Any, rand
     order = random.sample(range(len(paths)), len(paths))
     moved = turned(segment, angle, shift)
     arrays = {name: getattr(moved, name)[order] for name in ("agent_id", "position", "heading", "velocity")}
-    again = moved.replace(ego=order.index(0), **arrays)
+    again = hide(moved.replace(ego=order.index(0), **arrays), order.index(0), 15)  # nor does a gap
     choice = interactive_choice(again, 2)
     assert choice.context == context
     assert again.agent_id[choice.agents].tolist() == segment.agent_id[:2].tolist()
@@ -163,9 +167,11 @@ def ints(*values: int) -> np.ndarray:
 
 
 def test_the_nearest_vehicles_that_move_and_are_seen_come_first() -> None:
-    segment = abreast([30, 5, 10, 20], [2, 0.3, 2, 2])
+    segment = hide(abreast([30, 5, 10, 20], [2, 0.3, 2, 2]), 2, 4)  # parked, and out of sight once
     for count, chosen in ((1, [0]), (2, [0, 3]), (4, [0, 3, 4, 1])):
         assert interactive_agents(segment, count).tolist() == chosen
+    with pytest.raises(DataError, match="has 4"):
+        interactive_agents(segment, 5)
     kinds = segment.agent_type.copy()
     kinds[1:3] = AgentType.PEDESTRIAN, AgentType.CYCLIST
     late = hide(segment.replace(agent_type=kinds, interest=ints(1, 3)), 3, slice(0, 1))
@@ -215,8 +221,8 @@ def test_too_few_crowds_and_large_maps_are_left_out() -> None:
         interactive_agents(hide(few, 0, slice(0, 1)), 2)
     crowd = abreast([5.0 + k for k in range(258)], [2.0] * 258, file="log.xml")
     unseen = hide(crowd, 100, slice(None))
-    assert [excluded(crowd, 2), excluded(crowd, 3), excluded(unseen, 2)] == ["playback_agents", "", ""]
+    assert [excluded(hide(crowd, 100, 0), 2), excluded(crowd, 3), excluded(unseen, 2)] == ["playback_agents", "", ""]
     # By its length, not by how densely it is drawn.
-    assert contexts.road_points(with_lane(100, 0.1)) == contexts.road_points(with_lane(100, 50)) == 51
+    assert contexts.road_points(with_lane(100, 0.1)) == contexts.road_points(with_lane(99, 50)) == 51
     found = [excluded(with_lane(*size), 2) for size in ((19_990, 0.5), (20_010, 50))]
     assert found == ["", "roadgraph_points"]

@@ -176,9 +176,6 @@ def test_single_odd_things_are_left_out(path: Path, change: Change, kind: str) -
         assert np.argwhere(~found.valid).tolist() == [[0, 2]]
 
 
-# A real record
-
-
 @pytest.fixture(scope="module")
 def summary(samples: Path) -> dict[str, Any]:
     path = samples.parent / "wosac" / "scenario_637f20cafde22ff8.json"

@@ -123,9 +123,6 @@ def _use(segment: RunSegment, folder: Path) -> None:
             return
 
 
-# Good logs, and the changes that need their formats
-
-
 def _womd(folder: Path) -> Path:
     scenarios = [womd_scenario(f"{k:016x}", tracks=2 + k, steps=11) for k in range(2)]
     write_records(folder / "a.tfrecord", [scenario.SerializeToString() for scenario in scenarios])
@@ -222,9 +219,6 @@ BY_SUFFIX: Mapping[str, Callable[[Rng, bytes], bytes]] = {
     **{"tfrecord": _records, "json": change.json_, "parquet": _parquet, "csv": change.csv},
     **{"xml": change.xml, "osm": change.xml, "osm_xy": change.xml, "kml": change.xml, "pkl": change.pickle_},
 }
-
-
-# Stores, checkpoints and configurations
 
 
 def _store(folder: Path) -> Path:
@@ -325,9 +319,6 @@ def _read_configuration(folder: Path, _: str) -> tuple[str, str]:
     except ConfigError:
         return REFUSED, ""
     return ACCEPTED, ""
-
-
-# Submissions to the challenge
 
 
 def _submission(folder: Path) -> Path:
