@@ -88,13 +88,11 @@ def compare(kind: str, store: Path, world: Processes) -> dict[str, Any]:
     part, shared_gradient = descended(together, kind, own)
     shared = world.mean(part)
     return {
-        "counts": int(own.get(keys.VALID).sum()),
-        "values": {name: value.item() for name, value in values.items()},
-        "shared": {name: value.item() for name, value in shared.items()},
-        "gradient": gradient.norm().item(),
+        "counts": int(own.get(keys.VALID).sum()), "values": {name: value.item() for name, value in values.items()},
+        "shared": {name: value.item() for name, value in shared.items()}, "gradient": gradient.norm().item(),
         "gradient_off": (shared_gradient - gradient).abs().max().item(),
         "gradient_off_alone": (lone_gradient - 2 * gradient).abs().max().item(),
-    }
+    }  # fmt: skip
 
 
 def of_run(method: str, store: Path, out: Path, rank: int) -> dict[str, Any]:

@@ -48,12 +48,10 @@ def spec(space: Any) -> AgentSpec:
 
 def losses(agent: Any, env: DrivingEnv) -> dict[str, Any]:
     return {
-        "bc": BCLoss(agent.policy),
-        "distillation": DistillationLoss(agent.policy),
-        "goal": GoalLoss(agent.goals),
+        "bc": BCLoss(agent.policy), "distillation": DistillationLoss(agent.policy), "goal": GoalLoss(agent.goals),
         "discriminator": DiscriminatorLoss(agent.discriminator, gradient_penalty=1.0),
         "mgail": MGAILLoss(agent.policy, agent.discriminator, env, horizon=2),
-    }
+    }  # fmt: skip
 
 
 def world(space: Any, device: Any = "cpu", scenes: Any = SCENES) -> tuple[Any, DrivingEnv]:

@@ -48,8 +48,7 @@ def make_segment(
         size=np.tile(np.asarray(CAR, np.float32), (agents, 1)), position=xyz,
         heading=np.asarray(heading, np.float32), velocity=np.asarray(velocity, np.float32),
         valid=np.ones((agents, steps), bool), road=road, signal_lane=np.zeros(0, np.int32),
-        signal_point=np.zeros((0, 3), np.float32), signal_state=np.zeros((0, steps), np.uint8),
-        origin=np.zeros(3),
+        signal_point=np.zeros((0, 3), np.float32), signal_state=np.zeros((0, steps), np.uint8), origin=np.zeros(3),
     )  # fmt: skip
     return validate(segment.replace(**changes))
 
@@ -217,8 +216,7 @@ def random_segment(segment_id="random", seed=0, agents=3, steps=5, lanes=2, ligh
         road, lanes=lines(lanes, 2), lane_id=rng.permutation(lanes).astype(np.int64) + 2**40,
         lane_type=picks(len(LaneType), lanes).astype(np.uint8),
         speed_limit=np.where(rng.random(lanes) < 0.5, np.nan, rng.uniform(5, 30, lanes)).astype(np.float32),
-        successors=picks(lanes, int(rng.integers(4)), 2),
-        left_neighbors=picks(lanes, int(rng.integers(3)), 2),
+        successors=picks(lanes, int(rng.integers(4)), 2), left_neighbors=picks(lanes, int(rng.integers(3)), 2),
         right_neighbors=picks(lanes, int(rng.integers(3)), 2), boundary=lines(int(rng.integers(3)), 2),
         marks=lines(marks, 1), mark_type=picks(len(MarkType), marks).astype(np.uint8),
     )  # fmt: skip

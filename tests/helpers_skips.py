@@ -9,14 +9,11 @@ from pathlib import Path
 
 LIMITS = Path(__file__).parent / "skips.txt"
 KINDS = {
-    "a card": "no CUDA device",
-    "no card": "one kind of accelerator",
-    "real samples": r"sample|no summary at|no real WOMD",
-    "a browser": "no Chromium",
-    "a package": "could not import|not installed|needs the extra",
-    "a user other than root": "to root",
+    "a card": "no CUDA device", "no card": "one kind of accelerator",
+    "real samples": r"sample|no summary at|no real WOMD", "a browser": "no Chromium",
+    "a package": "could not import|not installed|needs the extra", "a user other than root": "to root",
     "another system": "not glibc|needs SIGKILL|needs /proc|/dev/full|Linux|file system|library of threads|/proc for",
-}
+}  # fmt: skip
 
 
 def by_kind(reasons: Iterable[str]) -> Counter[str]:

@@ -39,8 +39,7 @@ def test_derivatives_of_polynomials_are_exact(dt: float, count: int, order: int)
 
 @pytest.mark.parametrize("dt", [0.1, 0.2])
 @pytest.mark.parametrize(("speed", "kind", "kept", "broken"), [
-    (20, "along", lambda t: 2.35 * t, lambda t: 2.45 * t),
-    (20, "along", lambda t: -4.0 * t, lambda t: -4.1 * t),
+    (20, "along", lambda t: 2.35 * t, lambda t: 2.45 * t), (20, "along", lambda t: -4.0 * t, lambda t: -4.1 * t),
     (10, "turn", lambda t: 0.485 * t, lambda t: 0.495 * t),  # 4.85 and 4.95 m/s² across
     (2, "turn", lambda t: 0.94 * t, lambda t: 0.96 * t),
     # Sines, of which the rate is below its limit.

@@ -258,8 +258,7 @@ def overpass(height: float = HIGH, slope: float = 0.0, turn: float = 0.0) -> Run
     half = LANE_WIDTH / 2
     lanes = [line(0, 0, 0), line(1, 0, height)]
     boundary = [
-        line(0, -half, 0), line(0, half, 0, back=True), line(1, half, height),
-        line(1, -half, height, back=True),
+        line(0, -half, 0), line(0, half, 0, back=True), line(1, half, height), line(1, -half, height, back=True),
     ]  # fmt: skip
     speed, time = 10.0, 0.2 * np.arange(STEPS)
     position = np.zeros((3, STEPS, 3))

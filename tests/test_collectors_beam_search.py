@@ -254,21 +254,16 @@ def test_aggregates_by_hand():
 
 
 @pytest.mark.parametrize(("changes", "message"), [
-    ({"steps": 0}, "positive"),
-    ({"prune_every": 0}, "positive"),
-    ({"leaves": 5}, "leaves"),
-    ({"group_key": STREAM}, "takes groups"),
-    ({"group_key": "goal", "rule": collectors.ReplaceBad(0.0)}, "goal"),
+    ({"steps": 0}, "positive"), ({"prune_every": 0}, "positive"), ({"leaves": 5}, "leaves"),
+    ({"group_key": STREAM}, "takes groups"), ({"group_key": "goal", "rule": collectors.ReplaceBad(0.0)}, "goal"),
     ({"group_key": X, "rule": collectors.ReplaceBad(0.0)}, "integers, one or some per branch"),
-    ({"noise": torch.zeros(2, 2)}, "noise"),
-    ({"rule": collectors.Systematic(1.0)}, "noise"),
+    ({"noise": torch.zeros(2, 2)}, "noise"), ({"rule": collectors.Systematic(1.0)}, "noise"),
     ({"rule": lambda totals, noise: totals}, "int64"),
     ({"rule": lambda totals, noise: 1 / 0}, "ZeroDivisionError: division by zero"),
     ({"rule": lambda totals, noise: totals.argsort(-1)[:, :2]}, "int64"),
     ({"rule": lambda totals, noise: totals.argsort(-1) + 1}, "outside"),
     ({"rule": lambda totals, noise: totals.argsort(-1) - 1}, "outside"),
-    ({"score": lambda td: td.get(X)}, "scores must be"),
-    ({"aggregate": lambda scores: scores.sum()}, "aggregate"),
+    ({"score": lambda td: td.get(X)}, "scores must be"), ({"aggregate": lambda scores: scores.sum()}, "aggregate"),
 ])  # fmt: skip
 def test_contradictions_are_errors(changes, message):
     start = starts(Walk(), 2, branches=4)

@@ -75,8 +75,7 @@ TURNED = "<length>4</length><width>2</width><orientation>0.5</orientation><cente
 
 
 @pytest.mark.parametrize(("shape", "size", "place", "turn"), [
-    (RECTANGLE, (4.5, 2), (0, 0), 0),
-    ("<circle><radius>0.4</radius></circle>", (0.8, 0.8), (0, 0), 0),
+    (RECTANGLE, (4.5, 2), (0, 0), 0), ("<circle><radius>0.4</radius></circle>", (0.8, 0.8), (0, 0), 0),
     (f"<polygon>{POLYGON}</polygon>", (3, 1), (1.5, 0.5), 0),
     (f"<rectangle>{TURNED}</rectangle>", (4, 2), (1, 0.2), 0.5),
 ])  # fmt: skip
@@ -281,8 +280,7 @@ def problems_of(path: Path, *parts: str) -> list[RunSegment]:
 
 @pytest.mark.parametrize(("goal", "place", "lane"), [
     ('<lanelet ref="11"/>', (100, 0), 11),
-    ('<lanelet ref="12"/>', (50 + 40 * np.sin(np.pi / 4), 40 - 40 * np.cos(np.pi / 4)), 12),
-    (AREA, (90, 33), 12),
+    ('<lanelet ref="12"/>', (50 + 40 * np.sin(np.pi / 4), 40 - 40 * np.cos(np.pi / 4)), 12), (AREA, (90, 33), 12),
     (AREA + "<circle><radius>2</radius><center><x>92</x><y>35</y></center></circle>", (91, 34), 12),
     ("<point><x>140</x><y>1</y></point>", (140, 1), 11),
 ])  # fmt: skip

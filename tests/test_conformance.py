@@ -45,10 +45,8 @@ def test_readers_conform(tmp_path: Path) -> None:
 
 @pytest.mark.samples
 @pytest.mark.parametrize(("name", "pattern", "count"), [
-    ("womd", "womd/*.tfrecord", 1),
-    ("commonroad", "commonroad/*.xml", 5),
-    ("scenarionet", "real/scenarionet/*.pkl", 2),
-    ("commonroad", "commonroad/ngsim/USA_Lanker-2_10*.xml", 1),
+    ("womd", "womd/*.tfrecord", 1), ("commonroad", "commonroad/*.xml", 5),
+    ("scenarionet", "real/scenarionet/*.pkl", 2), ("commonroad", "commonroad/ngsim/USA_Lanker-2_10*.xml", 1),
     pytest.param("argoverse2", "argoverse2/*.parquet", 1, marks=needs_pyarrow),
 ])  # fmt: skip
 def test_samples_conform(name: str, pattern: str, count: int, samples: Path) -> None:
@@ -184,13 +182,8 @@ class LinesReader(Reader):
 
 
 @pytest.mark.parametrize(("fault", "expected"), [
-    ("", set()),
-    ("another each time", {"determinism"}),
-    ("one name", {"ids"}),
-    ("anonymous", {"source"}),
-    ("blames another", {"errors"}),
-    ("silent", {"errors", "segments"}),
-    ("raises", {"errors", "segments"}),
+    ("", set()), ("another each time", {"determinism"}), ("one name", {"ids"}), ("anonymous", {"source"}),
+    ("blames another", {"errors"}), ("silent", {"errors", "segments"}), ("raises", {"errors", "segments"}),
 ])  # fmt: skip
 def test_readers_that_break_a_promise(fault: str, expected: set[str], tmp_path: Path) -> None:
     paths = [tmp_path / f"{name}.lines" for name in ("a", "b")]

@@ -215,12 +215,10 @@ KEYS = {"own", "objects", "objects_mask", "points", "points_mask", "gap", "gap_a
 
 
 @pytest.mark.parametrize(("config", "missing"), [
-    (EVERYTHING, set()),
-    (ObservationConfig(num_objects=0, num_points=0), KEYS - {"own"}),
+    (EVERYTHING, set()), (ObservationConfig(num_objects=0, num_points=0), KEYS - {"own"}),
     (ObservationConfig(num_objects=0, num_points=7), KEYS - {"own", "points", "points_mask"}),
     (ObservationConfig(3, 0), KEYS - {"own", "objects", "objects_mask"}),
-    (ObservationConfig(0, 0, clearance=True, foresight=(1.0,)), KEYS - {"own", "road"}),
-    (NOTHING, KEYS),
+    (ObservationConfig(0, 0, clearance=True, foresight=(1.0,)), KEYS - {"own", "road"}), (NOTHING, KEYS),
 ])  # fmt: skip
 @pytest.mark.parametrize("shape", [(), (2, 3)])
 def test_there_are_entries_for_what_is_asked_for(config, missing, shape):

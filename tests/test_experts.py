@@ -250,11 +250,9 @@ def test_it_leads_back(speed: float, by: tuple[float, ...]) -> None:
 
 
 @given(
-    speed=st.floats(0, 30),
-    acceleration=st.floats(-4, 4),
-    lateral=st.floats(-6, 6),
+    speed=st.floats(0, 30), acceleration=st.floats(-4, 4), lateral=st.floats(-6, 6),
     dynamics=st.sampled_from([Displacement(), Bicycle(num_acceleration=401, num_steering=201)]),
-)
+)  # fmt: skip
 def test_a_label_brakes_and_turns_as_the_way_back_does(speed, acceleration, lateral, dynamics):
     """In either action space: a displacement to the same place would change the speed half as much."""
     # A turn with at most so many m/s^2 to the side, and the wheel not beyond 0.4 radians.

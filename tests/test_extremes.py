@@ -233,8 +233,7 @@ def drives(store: SegmentStore, space: str, cells: int, config: EvaluateConfig) 
 
 
 @pytest.mark.parametrize(("space", "cells", "search", "rule"), [
-    *(("bicycle", 0, *how) for how in SEARCHES),
-    *(("displacement", cells, "tree", "systematic") for cells in (0, 5)),
+    *(("bicycle", 0, *how) for how in SEARCHES), *(("displacement", cells, "tree", "systematic") for cells in (0, 5)),
 ])  # fmt: skip
 @pytest.mark.parametrize("network", ["policy", "goals", "discriminator"])
 def test_weights_that_are_not_finite_are_found_at_once(store, network, space, cells, search, rule):
@@ -256,9 +255,7 @@ def test_weights_that_are_not_finite_are_found_at_once(store, network, space, ce
 
 
 @pytest.mark.parametrize(("search", "rule", "value", "batch"), [
-    *((*how, math.nan, 3) for how in SEARCHES),
-    ("tree", "best", math.inf, 3),
-    ("none", "best", math.nan, 1),
+    *((*how, math.nan, 3) for how in SEARCHES), ("tree", "best", math.inf, 3), ("none", "best", math.nan, 1),
 ])  # fmt: skip
 def test_segment_and_step_are_those_where_it_began(store, search, rule, value, batch):
     good = make_agent()

@@ -21,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from helpers_segments import turned
+from helpers_segments import straight_road, turned
 from helpers_store import fill
 from symphony.cli import main
 from symphony.data import generate as generation
@@ -220,7 +220,7 @@ def altered(tmp_path: Path, segments: list[RunSegment]) -> Any:
     return alter
 
 
-def test_faults_are_found(altered: Any, segments: list[RunSegment]) -> None:
+def test_faults_are_found(altered: Any, segments: list[RunSegment], tmp_path: Path) -> None:
     segment = segments[0]
     ego, partner = interactive_agents(segment, 2)
     plain = altered()
@@ -240,6 +240,15 @@ def test_faults_are_found(altered: Any, segments: list[RunSegment]) -> None:
     assert any("offroad_time" in text for text in shortfalls(moved))
     velocity = segment.velocity * 2
     assert altered(velocity=velocity)["speed"]["mean"] == pytest.approx(2 * plain["speed"]["mean"], abs=2e-4)
+    assert measure(fill(tmp_path / "left", segments[2:3]))["directions"] == {"straight": 0, "left": 100, "right": 0}
+    # What is not there does not count: here 15 of 50 + 34 steps are off the road.
+    half = straight_road(2)
+    half.valid[1, 10:20] = half.valid[1, 45:] = False
+    half.velocity[1, 10:20] = half.position[1, 45:] = 99
+    found = measure(fill(tmp_path / "half", [half]))
+    assert (found["acceleration"]["std"], found["fit_error"]["max"]) == pytest.approx((0, 0), abs=0.3)
+    half.position[1, 30:45, 1] += 50
+    assert measure(fill(tmp_path / "off", [half]))["offroad_time"] == pytest.approx(100 * 15 / 84, abs=1e-3)
 
 
 def test_measures_do_not_depend_on_which_way_north_is(altered: Any, segments: list[RunSegment]) -> None:

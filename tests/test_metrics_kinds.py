@@ -89,6 +89,9 @@ def test_the_first_collision_counts_and_of_several_the_deepest():
     # Rear-ended at once, pushed nowhere, into the leader later.
     found = collision_kinds(**stage((0, 0, 0, 10), (-6, 0, 0, 24), (20, 0, 0, 0)))
     assert (found.kind.tolist(), found.other.tolist()) == ([KIND.REAR_ENDED], [1])
+    # Of one step: a tail grazed by 0.1 m after 0.3 of it, one met squarely after 0.8, which is 1 m deep at its end.
+    found = collision_kinds(**stage((0, 0, 0, 25), (6, 1.9, 0, 0), (8.5, -0.5, 0, 0)))
+    assert (found.step.tolist(), found.other.tolist()) == ([0], [1])
     # At the same step: 0.1 m into the flank of one, half a metre into the tail of the other.
     found = collision_kinds(**stage((0, 0, 0, 5), (5, 0, 0, 0), (0, 3.9, -90, 5), size=(4.5, 2.0)))
     assert (found.kind.tolist(), found.other.tolist()) == ([KIND.INTO_LEADER], [1])
@@ -214,6 +217,9 @@ def test_nobody_meets_whom_is_on_another_level():
     first[1, 1:], second[1, :1], second[1, 2:] = level[0, 0], level[0, 0], level[0, 0]
     for height in (None, *((each[:1], each) for each in (low, first, second))):
         assert collision_kinds(**inputs, height=height).other.tolist() == [1]
+    # Who was not there before is where it is now.
+    inputs["log_valid"][1, 0], second[1, 1:] = False, level[1, 0]
+    assert collision_kinds(**inputs, height=(second[:1], second)).other.tolist() == [2]
 
 
 @pytest.mark.parametrize("name", list(CASES)[::4])

@@ -96,7 +96,6 @@ def test_a_conversion_counts_and_tells(tmp_path: Path) -> None:
     convert(Mixed(), [tmp_path / "more.scene"], tmp_path / "more", workers=2)
     merge([tmp_path / "all", tmp_path / "more"], tmp_path / "both")
     assert info(tmp_path / "both")["overlaps"] == 3
-
     without = convert(Mixed(), [tmp_path], tmp_path / "clean", exclude_overlaps=True, workers=2)
     assert (without.converted, without.overlaps, without.warning) == (4, 0, "")
     assert without.exclusions["overlaps"] == 3

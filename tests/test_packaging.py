@@ -164,12 +164,10 @@ def test_long_files_and_rooms_are_found(tmp_path: Path) -> None:
     (room / "made_pb2.py").write_text("x = 1\n" * 900)
     rows = ["| `deep` | all | – | 1 100 | {} |", "| `docs/` | pages | | 12 words | |"]
     for lines, today, expected in (
-        (600, "1 200", []),
-        (601, "1 201", ["src/symphony/deep/long.py: 601 lines, may have 600"]),
-        (600, "1 199", ["deep: 1200 lines, may have 1199"]),
-        (600, "", ["deep: 1200 lines, may have 1100"]),
+        (600, "1 200", []), (601, "1 201", ["src/symphony/deep/long.py: 601 lines, may have 600"]),
+        (600, "1 199", ["deep: 1200 lines, may have 1199"]), (600, "", ["deep: 1200 lines, may have 1100"]),
         (500, "", []),
-    ):
+    ):  # fmt: skip
         (room / "long.py").write_text("x = 1\n" * lines)
         (tmp_path / "CONTRIBUTING.md").write_text("\n".join(rows).format(today))
         assert lint_length.long_files(tmp_path) + lint_length.large_rooms(tmp_path) == expected

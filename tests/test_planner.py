@@ -163,12 +163,10 @@ def test_it_sees_everyone_and_its_controls_are_a_vehicles() -> None:
     others = np.setdiff1d(np.arange(segment.num_agents), interactive)
     for t in mine:
         for found, expected in (
-            (t.position[interactive], state[t.step, :, :2]),
-            (t.state, state[t.step, 0]),
+            (t.position[interactive], state[t.step, :, :2]), (t.state, state[t.step, 0]),
             (t.position[others], segment.position[others, t.step, :2]),
-            (t.velocity[others], segment.velocity[others, t.step]),
-            (t.time, t.step * segment.dt),
-        ):
+            (t.velocity[others], segment.velocity[others, t.step]), (t.time, t.step * segment.dt),
+        ):  # fmt: skip
             np.testing.assert_allclose(found, expected, atol=1e-4)
         assert (t.valid[others] == segment.valid[others, t.step]).all()
         assert (t.lights == segment.signal_state[:, t.step]).all()
@@ -425,12 +423,10 @@ def in_a_row(speeds: list[float], starts: list[float], steps: int = 106, lane: A
 
 
 ROWS = {
-    "standing-3": in_a_row([3, 0], [20, 130]),
-    "standing-14": in_a_row([14, 0], [20, 130]),
-    "leader": in_a_row([10, 8], [20, 45]),
-    "alone": in_a_row([10], [60]),
+    "standing-3": in_a_row([3, 0], [20, 130]), "standing-14": in_a_row([14, 0], [20, 130]),
+    "leader": in_a_row([10, 8], [20, 45]), "alone": in_a_row([10], [60]),
     "others": in_a_row([10, 0, 0], [60, 100, 30], lane=(0, 1, 0)),
-}
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

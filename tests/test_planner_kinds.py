@@ -260,7 +260,7 @@ def test_bounds_and_neighbours_of_lanes() -> None:
                 assert set(getattr(lane, name)) == set(road.lane_id[pairs[pairs[:, 0] == k, 1]].tolist())
 
 
-FINE = dict.fromkeys(("failed", "at_fault_collision", "red_lights", "beyond_route", "no_route"), 0)
+FINE = dict.fromkeys(("failed", "at_fault_collision", "red_lights", "beyond_route", "no_route", "offroad_time"), 0)
 
 
 @pytest.mark.parametrize(("changes", "score"), [
@@ -270,9 +270,10 @@ FINE = dict.fromkeys(("failed", "at_fault_collision", "red_lights", "beyond_rout
     ({"progress_ratio": None, "beyond_route": 1, "at_fault_collision": True}, 0.0),
     ({"progress_ratio": None, "beyond_route": None, "failed": "why"}, 0.0),
     ({"collision": True}, 50.0), ({"red_lights": 1}, 0.0), ({"offroad_time": 2.0}, 0.0),
+    ({"progress_ratio": None, "logged_steps": 0}, None),
 ])  # fmt: skip
 def test_the_score_of_a_run(changes: dict[str, Any], score: float | None) -> None:
-    assert run_score({**FINE, "offroad_time": 0, "progress_ratio": 0.5, **changes}) == score
+    assert run_score({**FINE, "progress_ratio": 0.5, **changes}) == score
 
 
 def test_the_command_compares_planners_among_crowds(store, tmp_path, capsys):
@@ -346,6 +347,11 @@ def test_runs_without_defined_progress_have_no_score(tmp_path: Path) -> None:
     assert lines == [["hurries", "100.0 ± 0.0", "2"], ["none", "–", "2"]]
     assert paired_difference(record, other) == (None, None, 0)
     assert winners([other, record])[0].startswith("log: hurries is first, within the error, –")
+    # Ahead by 2.7 standard errors over four recordings, where Student's t of 3 degrees asks for 3.2.
+    for one, ahead in ((record, (0.0112, 0.0512)), (other, (0.0, 0.0))):
+        runs = [{"segment": f"{k}", "group": f"{k % 4}", "progress_ratio": 0.5 + ahead[k % 2]} for k in range(8)]
+        one |= {"per_run": [FINE | run for run in runs], "score": 50 + ahead[0]}
+    assert winners([other, record])[0].startswith("log: hurries is first, within the error, 3.1 ± 1.2")
 
 
 def several(out: Path, segment: RunSegment, planner: Any, drives: Any, agent: Any = "playback", **how: Any):
@@ -406,14 +412,12 @@ def test_planners_of_others_fail_by_their_name_and_what_can_not_be_is_told(store
     assert saved.counted[0].sum(0).tolist() == [3, 3]
     words = f"simulate playback --data {tmp_path / 'store'} --duration 2 --out {tmp_path / 'out'} --planner"
     for given, status, why in (
-        ("3=idm", 1, "the ego has one planner, there is none"),
-        ("idm log", 1, "2 are named: idm, log"),
+        ("3=idm", 1, "the ego has one planner, there is none"), ("idm log", 1, "2 are named: idm, log"),
         (f"idm {agent}=log {agent}=idm", 1, f"agent {agent} already has another one"),
         (f"idm {agent}=no.py:plan", 1, "no such file"),
         (f"idm {agent}=log --goal {agent}=1,2", 1, f"a planner drives agent {agent}"),
-        ("idm 99=log", 3, "99: not all are ids of vehicles beside the ego"),
-        (f"log {agent}=idm", 0, ""),
-    ):
+        ("idm 99=log", 3, "99: not all are ids of vehicles beside the ego"), (f"log {agent}=idm", 0, ""),
+    ):  # fmt: skip
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
         assert main([*words.split(), *given.split()]) == status
         assert why in capsys.readouterr().err

@@ -106,8 +106,7 @@ OTHERS = "there are: pretrained:other, pretrained:tiny"
 @pytest.mark.parametrize(("name", "message"), [
     ("pretrained:tinny", f"did you mean 'pretrained:tiny'\\? {OTHERS}"),
     ("pretrained:", f"no agent 'pretrained:' comes with this package; {OTHERS}"),
-    ("pretrained:../pretrained/tiny", "no agent"),
-    ("pretrained:tiny@3", "has no checkpoint yet"),
+    ("pretrained:../pretrained/tiny", "no agent"), ("pretrained:tiny@3", "has no checkpoint yet"),
 ])  # fmt: skip
 def test_unknown_names(name, message, tmp_path, monkeypatch):
     monkeypatch.setattr(pretrained, "FOLDER", tmp_path)

@@ -65,6 +65,8 @@ def test_time_to_collision_is_when_boxes_meet_that_go_on(one: Any, two: Any) -> 
     segment = driving(one, two, steps=2)
     world = world_of(played(segment), 0)
     found = float(time_to_collision(world, np.array([0]))[0, 0])
+    alone = world._replace(valid=world.valid & np.array([[True], [False]]))
+    assert (time_to_collision(alone, np.array([0])) == math.inf).all()
 
     def gap(time: float) -> float:
         place = torch.from_numpy(world.position[:, 0] + time * world.velocity[:, 0])
@@ -82,17 +84,17 @@ def test_time_to_collision_is_when_boxes_meet_that_go_on(one: Any, two: Any) -> 
 
 
 def test_a_known_profile_has_its_acceleration_jerk_and_lateral_acceleration() -> None:
-    """Speed 5 - t^3 / 3: acceleration and jerk are differences of it; a circle of 20 m at 10 m/s: 5 m/s^2."""
+    """Speed 5 - t^3 / 3: acceleration and jerk are its differences; 0.5 rad/s at 11.9 m/s on average: 5.95 m/s^2."""
     saved, time = played(driving((0, 0, 0, 10), steps=11), rollouts=2), np.arange(11) * DT
     saved.state[0, :, 0, 3] = speed = 5 - time**3 / 3
     saved.state[0, :, 0, 2] = 0
-    saved.state[1, :, 0, 2] = 3 + 0.5 * time
-    saved.state[1, :, 0, 3] = 10
+    saved.state[1, :, 0, 2] = (3 + 0.5 * time + np.pi) % (2 * np.pi) - np.pi
+    saved.state[1, :, 0, 3] = 10 + time
     straight, turning = rows(saved)
     assert straight["max_braking"] == pytest.approx(-np.diff(speed).min() / DT, rel=1e-4)
     assert straight["max_jerk"] == pytest.approx(np.abs(np.diff(speed, 2)).max() / DT**2, rel=1e-3)
-    assert straight["max_lateral_acceleration"] == turning["max_jerk"] == 0
-    assert turning["max_lateral_acceleration"] == pytest.approx(5, rel=1e-4)
+    assert (straight["max_lateral_acceleration"], turning["max_jerk"]) == (0, pytest.approx(0, abs=1e-3))
+    assert turning["max_lateral_acceleration"] == pytest.approx(5.95, rel=1e-4)
 
 
 def rows(saved: SavedRollouts, evaluated: Any = "interactive") -> list[dict[str, Any]]:
@@ -126,22 +128,25 @@ def test_progress_is_along_the_route_and_relative_to_the_log(lines: list[Any]) -
     assert (row["progress"], row["progress_ratio"]) == pytest.approx((16, 0.4), abs=1e-4)
 
 
-def red(states: Any = SignalState.STOP, others: Any = SignalState.GO) -> list[tuple[int, int]]:
+def red(states: Any = SignalState.STOP, others: Any = SignalState.GO, aside: float = 0) -> list[tuple[int, int]]:
     """Step and light of every red light that a car runs which comes from the south and goes straight on."""
     segment = crossing(1, steps=31, seed=0)
-    path = np.stack([np.full(31, 1.75), -20 + np.arange(31) * 1.2], -1)
+    path = np.stack([np.full(31, 1.75 + aside), -20 + np.arange(31) * 1.2], -1)
     position = np.pad(path, ((0, 0), (0, 1)))[None].astype("f4")
     light = np.full((12, 31), others, np.uint8)
     light[0] = states
     heading = np.full((1, 31), np.pi / 2, np.float32)
     segment = segment.replace(position=position, heading=heading, signal_state=light)
-    found = red_lights(world_of(played(segment), 0), np.array([0]), Lanes(segment), 0)
-    return list(zip(found.step.tolist(), found.light.tolist(), strict=True))
+    saved = played(segment)
+    whole, rest = (red_lights(world_of(later(saved, k), 0), np.array([0]), Lanes(segment), k) for k in (0, 4))
+    assert (whole.step.tolist(), whole.light.tolist()) == ((rest.step + 4).tolist(), rest.light.tolist())
+    return list(zip(whole.step.tolist(), whole.light.tolist(), strict=True))
 
 
 def test_a_red_light_is_run_where_the_front_crosses_the_stop_point() -> None:
     # The front, 2.3 m ahead of the centre, crosses y = -12 after (20 - 2.3 - 12) / 1.2 steps.
-    assert red() == red(SignalState.ARROW_STOP) == [(5, 0)]
+    assert red() == red(aside=1.7) == red(SignalState.ARROW_STOP) == [(5, 0)]
+    assert red(aside=1.8) == []
     early = np.where(np.arange(31) < 5, SignalState.STOP, SignalState.GO)
     for state in (SignalState.GO, SignalState.CAUTION, SignalState.FLASHING_STOP, SignalState.UNKNOWN, early):
         assert red(state) == []
@@ -209,6 +214,29 @@ def test_times_are_percent_of_what_was_driven() -> None:
     assert [row["steps"] for row in found] == [30, 40]
     assert [row["offroad_time"] for row in found] == pytest.approx([100 * 5 / 30, 0])
     assert total_numbers(found)["offroad_time"] == pytest.approx(100 * 5 / 70)
+    # What an agent that is not there is said to do does not count.
+    saved.state[0, 11:, 1] = 99
+    assert (rows(saved), found[0]["max_acceleration"]) == (found, pytest.approx(0, abs=1e-4))
+
+
+def later(saved: SavedRollouts, start: int) -> SavedRollouts:
+    parts = {name: getattr(saved, name)[:, start:] for name in ("state", "counted", "collision", "offroad")}
+    return dataclasses.replace(saved, start=start, **parts)
+
+
+@pytest.mark.parametrize(("logged", "aside", "light", "green", "start", "percent"), [
+    (25, 9, 99, 0, 0, 40), (26, 9, 99, 0, 0, 0),  # 3 s at least, once the log has ended
+    (25, None, 99, 0, 0, 40), (25, 0, 99, 0, 0, 0), (25, 2.2, 99, 0, 0, 0), (25, 2.5, 99, 0, 0, 40),
+    (25, 9, 14, 0, 0, 0), (25, 9, 16, 0, 0, 40), (11, 9, 14, 30, 20, 0),
+])  # fmt: skip
+def test_who_stands_on_a_free_road_blocks_it(logged, aside, light, green, start, percent) -> None:
+    """One ahead stands aside, or is not there any more; a light ahead of the front has been green for some steps."""
+    segment = driving((0, 0, 0, 0), (8, aside or 0, 0, 0), steps=41, logged=logged)
+    segment.valid[1] = aside is not None
+    how: dict[str, Any] = {"signal_lane": np.zeros(1, np.int32)}
+    how["signal_point"] = np.array([[0.5 * segment.size[0, 0] + light, 0, 0]], np.float32)
+    how["signal_state"] = np.where(np.arange(41) < green, SignalState.GO, SignalState.STOP).astype(np.uint8)[None]
+    assert rows(later(played(segment.replace(**how)), start))[0]["blocking_time"] == pytest.approx(percent)
 
 
 def test_the_ego_alone_is_evaluated_on_request() -> None:
@@ -218,6 +246,11 @@ def test_the_ego_alone_is_evaluated_on_request() -> None:
     assert not rows(saved, "ego")[0]["collision"]
     with pytest.raises(DataError, match="ego was not driven"):
         rows(played(segment, [1]), "ego")
+    # Through one another within a step, which no state shows; later they stand on each other.
+    for again in (False, True):
+        jumps = driving((0, 0, 0, 0), (0, 10, 0, 0))
+        jumps.position[1, 5:, 1], jumps.position[1, 9:, 1] = -10, -10 * (not again)
+        assert rows(played(jumps))[0].items() >= {"collisions": 1, "collision_at_states": again}.items()
 
 
 def test_contacts_are_those_that_the_simulation_flagged() -> None:

@@ -196,7 +196,6 @@ def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(tmp_path, mon
     assert (record["run"]["method"], record["run"]["updates"]) == ("bc", 2)
     visited = [np.array(record["curvature"][part]) for part in ("policy", "log")]
     assert float(jensen_shannon(*visited)) == pytest.approx(record["curvature_jsd"], nan_ok=True)
-
     table = ["table", "--setting", "main", "--runs", str(run)]
     out, picture = tmp_path / "out" / "table.json", tmp_path / "out" / "curvature.png"
     assert main([*table, "--format", "json", "--out", str(out)]) == 0
@@ -207,7 +206,6 @@ def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(tmp_path, mon
     figure = ["plot", "curvature", str(run), "--out", str(picture)]
     assert main(figure) == 0
     assert picture.stat().st_size > 5_000
-
     assert main([*command, "--seed", "5"]) == 0
     assert len(kept_evaluations(run)) == 2
     for again in (table, figure):

@@ -99,12 +99,10 @@ def test_the_current_folder_is_not_searched_for_it(stranger: Callable[..., Path]
 
 
 LARGE: list[dict[str, Any]] = [
-    *({"agent__hidden": n} for n in (60_000, 60_000_000, 2**62)),
-    {"agent__accelerations": 10**9 + 1},
-    {"action_space": "displacement", "agent__cells": 10**9 + 1},
-    {"discriminator__hidden": 10**9},
+    *({"agent__hidden": n} for n in (60_000, 60_000_000, 2**62)), {"agent__accelerations": 10**9 + 1},
+    {"action_space": "displacement", "agent__cells": 10**9 + 1}, {"discriminator__hidden": 10**9},
     *({name: 10**9} for name in ("agent__num_points", "agent__num_lights", "search__test_branches")),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("settings", LARGE)

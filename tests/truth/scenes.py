@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 from made import GREEN, NORTH, OWN, RED, RIGHT, WALKER, WEST, Case, Track
@@ -60,15 +61,16 @@ def collisions() -> list[Case]:
         found.append(Case(f"an oncoming one invades the ego's lane, at {v:g}",
                 "the ego keeps its lane, the other is where it must not be", ego(v),
                 (car(40 + far, OWN, v, math.pi),), hit("oncoming", False, gap / (2 * v))))
+    for v, (where, x, fault) in product((-8.0, 8.0, 16.0), (("flank", 165, False), ("corner", 162.25, True))):
+        found.append(Case(f"hit in the {where} by one that crosses, at {v:g}",
+                "in the ego's lane: the other's nose meets the middle of its side, or the last 0.4 m",
+                ego(v, x=x - 2 * v), (car(165, OWN - 27.15, 12.0, NORTH),), hit("crossing", fault, 2.0)))
     for v in (8.0, 16.0):
         # The ego's front is at the crosser's flank, x = 165 - 0.9, when the crosser's centre is in the lane.
         time = 48 / v
         found.append(Case(f"into the flank of one that crosses, at {v:g}", "the nose meets a flank",
                 ego(v, x=165 - 0.9 - 2.25 - 48), (car(165, OWN - 6 * time, 6.0, NORTH),),
                 hit("crossing", True, time)))
-        found.append(Case(f"hit in the flank by one that crosses, at {v:g}",
-                "the other's nose meets the middle of the ego's side in the ego's lane", ego(v, x=165 - 2 * v),
-                (car(165, OWN - 0.9 - 2.25 - 12 * 2, 12.0, NORTH),), hit("crossing", False, 2.0)))
         found.append(Case(f"hit in the flank after a red light, at {v:g}",
                 "the same, but it ran the light: who crosses may count on it", ego(v, x=165 - 4 * v),
                 (car(165, OWN - 0.9 - 2.25 - 12 * 4, 12.0, NORTH),), hit("crossing", True, 4.0, red=1),
@@ -83,38 +85,34 @@ def collisions() -> list[Case]:
 
 def manoeuvres() -> list[Case]:
     """Scenes whose last metres do not tell whose fault it is."""
-    standing = car(80, OWN, 0.0)
     return [
-        Case("into one that stands", "what stands is in nobody's way for which it could be blamed", ego(),
-            (standing,), hit("into leader", True, (40 - 4.5) / 10)),
+        Case("into one that stands", "it still moved when it came there, 3 cm before its own stand",
+            stops(ego(), 0.0, 5.0), (car(40 + 10 - 0.03 + 4.5, OWN, 0.0),), hit("into leader", True)),
         Case("into one that brakes hard", "a safe distance is for that", ego(), (stops(car(60), 0.0, 5.0),),
             hit("into leader", True)),
         Case("brakes hard and is hit", "who is behind keeps the distance, whatever the reason for braking is",
             stops(ego(), 1.0, 8.0), (car(28),), hit("rear ended", False), log=ego()),
         Case("hit while it stands", "an agent that has stopped hits nobody", stops(ego(), 0.0, 5.0),
-            (car(25, OWN, 8.0),), hit("rear ended", False, (40 + 10 - 25 - 4.5) / 8),
-            log=stops(ego(), 0.0, 5.0)),
+            (car(25, OWN, 8.0),), hit("rear ended", False, (40 + 10 - 25 - 4.5) / 8), log=stops(ego(), 0.0, 5.0)),
         Case("hit head-on while it stands in the wrong lane",
             "an agent that has stopped hits nobody, as nuPlan has it", ego(0.0, y=WEST),
             (car(80, WEST, 10.0, math.pi),), hit("oncoming", False, 3.55)),
         Case("the ego cuts in closely before a faster one",
-            "16 m ahead of one that closes in with 8 m/s: by RSS 10 m/s before 18 m/s need 66 m",
+            "16 m ahead of one that closes in with 8 m/s: by RSS 10 m/s before 18 m/s need 71 m",
             ego(aside=(0.4, 1.4, -3.5)), (car(12, RIGHT, 18.0),), hit("rear ended", True, (28 - 4.5) / 8)),
         Case("the ego cuts in far enough before one that speeds up",
             "29 m ahead, and by RSS 28.3 m are enough for two at 10 m/s", ego(x=73.5, aside=(0.0, 1.0, -3.5)),
-            (car(40, RIGHT, 10.0, change=(0.75, 9.0, 5.0)),),
-            hit("rear ended", False, 0.75 + math.sqrt(29 / 2.5))),
+            (car(40, RIGHT, 10.0, change=(0.75, 9.0, 5.0)),), hit("rear ended", False, 0.75 + math.sqrt(29 / 2.5))),
         Case("the ego cut in long before",
             "more than four seconds ago: since then the one behind had time to fall back",
             ego(aside=(0.0, 0.5, -3.5)), (car(21, RIGHT, 12.0),), hit("rear ended", False, (19 - 4.5) / 2)),
         Case("another cuts in closely and brakes",
             "6 m ahead and slower: there is nothing that the ego could do", ego(12.0),
             (car(52, RIGHT, 8.0, aside=(0.0, 1.0, 3.5), change=(1.0, 2.0, -4.0)),), hit("into leader", False)),
-        Case("another cuts in closely and stands", "it is hit standing, but brought that about", ego(12.0),
-            (car(58, RIGHT, 8.0, aside=(0.0, 1.0, 3.5), change=(0.5, 1.3, -10.0)),), hit("into leader", False)),
-        Case("another cuts in far ahead and stands",
-            "42 m ahead, and by RSS 40 m are enough for 12 m/s behind 8 m/s", ego(12.0, x=20),
-            (car(68.5, RIGHT, 8.0, aside=(0.0, 1.0, 3.5), change=(0.6, 1.4, -10.0)),),
+        Case("another cuts in too closely and stands", "35 m ahead, where RSS wants 40 m", ego(12.0),
+            (car(81.5, RIGHT, 8.0, aside=(0.0, 1.0, 3.5), change=(0.5, 1.3, -10.0)),), hit("into leader", False)),
+        Case("another cuts in far ahead and stands", "42 m ahead, and by RSS 40 m are enough for 12 m/s behind 8 m/s",
+            ego(12.0, x=20), (car(68.5, RIGHT, 8.0, aside=(0.0, 1.0, 3.5), change=(0.6, 1.4, -10.0)),),
             hit("into leader", True, (68.5 + 8 * 0.6 + 3.2 - 4.5 - 20) / 12)),
         Case("the ego changes lane into a tail", "it comes from behind: the other stayed where it was",
             ego(14.0, aside=(0.0, 1.0, -3.5)), (car(60, RIGHT, 6.0),), hit("into leader", True, (20 - 4.5) / 8)),
@@ -137,12 +135,12 @@ def manoeuvres() -> list[Case]:
             hit("crossing", True, 4.0, red=0), light=((0.0, GREEN),)),
         Case("hit from behind after a red light", "the light was for those who cross", ego(x=130),
             (car(100, OWN, 17.0),), hit("rear ended", False, (30 - 4.5) / 7, red=1), light=((0.0, RED),)),
-        Case("the ego backs into one behind", "backing", ego(-3.0), (car(28, OWN, 0.0),),
-            hit("other", True, 2.5)),
+        Case("the ego backs into one behind", "backing", ego(-3.0), (car(28, OWN, 0.0),), hit("other", True, 2.5)),
         Case("the ego backs into somebody on foot", "backing", ego(-2.0),
             (walker(40 - 2.25 - 4 - 0.3, OWN, 0.0),), hit("crossing", True, 2.0)),
-        Case("somebody on foot walks into the ego's side", "the nose is past, and the ego within its lane",
-            ego(5.0), (walker(50, OWN - 0.9 - 0.3 - 2 * 1.2),), hit("crossing", False, 2.0)),
+        Case("somebody on foot walks into the ego's side", "the nose is past; the light is run only later",
+            ego(5.0, x=130), (walker(140, OWN - 0.9 - 0.3 - 2 * 1.2),), hit("crossing", False, 2.0, red=1),
+            light=((0.0, RED),)),
         Case("a cyclist runs into the ego's tail", "hit from behind", ego(4.0),
             (Track(20, OWN, 8.0, size=(1.8, 0.6), kind=AgentType.CYCLIST),),
             hit("rear ended", False, (20 - 2.25 - 0.9) / 4)),
@@ -153,13 +151,16 @@ def manoeuvres() -> list[Case]:
             ego(28.0, size=(1.0, 0.8)), (Track(90.0, OWN, 0.0, size=(0.4, 0.4), kind=AgentType.PEDESTRIAN),),
             hit("into leader", True, (50 - 0.5 - 0.2) / 28)),
         Case("through one another head-on within a step",
-            "64 m/s together are 12.8 m in a fifth of a second, and two boxes are 9 m long",
-            ego(32.0, y=WEST, x=5.0), (car(205, WEST, 32.0, math.pi),),
-            hit("oncoming", True, (200 - 4.5) / 64, wrong=True)),
+            "64 m/s together are 12.8 m in a fifth of a second, and two boxes are 9 m long", ego(32.0, y=WEST, x=5.0),
+            (car(205, WEST, 32.0, math.pi),), hit("oncoming", True, (200 - 4.5) / 64, wrong=True)),
         Case("flanks pass each other at 5 cm", "nobody touches anybody", ego(20.0, y=OWN),
             (car(140, OWN + 1.85, 20.0, math.pi),), {}),
         Case("one appears on the spot where another passed", "who is not seen is met by nobody", ego(),
             (car(60, OWN, 0.0, there=(5.0, 99.0)),), {}),
+        Case("one appears in the ego's flank", "what comes before is not known", ego(30.0, x=5.0),
+            (car(5.0, OWN - 1.73, 30.0, there=(2.0, 99.0)),), hit("sideswipe", False)),
+        Case("somebody on foot comes into the way of the ego", "pedestrians change no lanes", ego(),
+            (walker(69.55, OWN - 3, 1.0, 0.0, aside=(1.0, 2.5, 3.0), turned=False),), hit("into leader", True, 3.0)),
         Case("hits two at once", "a pair each; one at fault is enough", ego(),
             (walker(70, OWN - 0.5, 0.0), walker(70, OWN + 0.5, 0.0)),
             hit("crossing", True, (30 - 2.25 - 0.3) / 10, collisions=2)),
@@ -202,11 +203,10 @@ def rules() -> list[Case]:
             log=ego(x=100)),
         Case("leaves the road", "the centre is below y = -7 after 1 s of 2 m/s and for the last 3.4 s or so",
             ego(aside=(1.0, 8.9, -15.8), turned=False), (), {"offroad": 100 * (8 - 3.625) / 8}),
-        Case("keeps to the road", "all the time", ego(), (), {"offroad": 0.0, "wrong": False}),
+        Case("keeps to the road", "all the time", ego(y=-0.1), (), {"offroad": 0.0, "wrong": False}),
         Case("drives in the oncoming lane", "a lane that leads the other way, and none that leads its way",
             ego(y=WEST), (), {"wrong": True}),
-        Case("stands in the oncoming lane", "standing is driving no way", ego(0.0, y=WEST), (),
-            {"wrong": False}),
+        Case("stands in the oncoming lane", "standing is driving no way", ego(0.0, y=WEST), (), {"wrong": False}),
         Case("no boundary", "there is nothing to be off", ego(), (), {"offroad": None}, boundary=False),
         Case("no lights", "there is nothing to run", ego(), (), {"red": None}),
         Case("no lanes", "there is no wrong way", ego(), (), {"wrong": None, "blocking": None}, lanes=False),
