@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 PACKAGE = ROOT / "src" / "symphony"
 ROOMS = ["geometry", "roadgraph", "envs", "modules", "collectors", "objectives", "learning"]
-ROOMS += ["rollouts", "metrics"]
+ROOMS += ["rollouts", "metrics", "evaluation"]
 """Where changes are made unless others are asked for: rooms that compute."""
 SECONDS = 300  # CPU time that the tests may take with a change: one that goes on for ever is noticed, too
 OPERATORS: dict[type, type] = {
