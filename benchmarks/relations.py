@@ -35,72 +35,68 @@ from symphony.metrics.intervals import clustered_mean
 
 CLEAR = 2.0
 """Standard errors by which a number must differ from its bound to differ clearly."""
-STATEMENTS: tuple[tuple[str, str, str, str | float], ...] = (
-    ("collision_rate", "bc", "bc_ts", 1.0),
+STEPS: tuple[tuple[str, str], ...] = (
+    ("bc", "bc_ts"), ("bc_h", "bc_ts_h"), ("mgail", "mgail_ts"), ("mgail_h", "mgail_ts_h"),
+    ("bc", "bc_h"), ("bc_ts", "bc_ts_h"), ("mgail", "mgail_h"), ("mgail_ts", "mgail_ts_h"),
+    ("bc", "mgail"), ("bc_h", "mgail_h"), ("bc_ts", "mgail_ts"), ("bc_ts_h", "mgail_ts_h"),
+)  # fmt: skip
+"""Pairs of methods that differ by one thing: the search, goals, or MGAIL instead of BC."""
+FACTORS: tuple[tuple[str, str, str, float], ...] = (
     ("collision_rate", "bc", "bc_ts_h", 9.3),
     ("offroad_time", "bc", "bc_ts_h", 6.4),
-    ("collision_rate", "mgail", "mgail_ts", 1.0),
-    ("collision_rate", "mgail_h", "mgail_ts_h", 1.0),
     ("collision_rate", "mgail", "mgail_ts_h", 2.2),
-    ("collision_rate", "bc", "mgail", "falls"),
-    ("min_sade", "bc_h", "bc_ts_h", "does not rise"),
-    ("ade", "bc_ts", "bc_ts_h", "falls"),
-    ("min_sade", "bc_ts", "bc_ts_h", "falls"),
-    ("ade", "mgail_ts", "mgail_ts_h", "falls"),
-    ("min_sade", "mgail_ts", "mgail_ts_h", "falls"),
-    ("curvature_jsd", "bc", "bc_ts", "rises"),
-    ("curvature_jsd", "bc_ts", "bc_ts_h", "falls"),
-    ("curvature_jsd", "mgail", "mgail_ts", "rises"),
-    ("curvature_jsd", "mgail_ts", "mgail_ts_h", "falls"),
 )
-"""The statements of the paper's tables: a metric, from which method to which, and what it does: a number is how many
-times it falls at least. The divergence must do so beyond its sampling."""
+"""What the paper's text claims: a metric falls at least so many times from one method to another."""
 
 Relation = dict[str, Any]
-"""A statement beside our numbers, see :func:`relations`."""
+"""A relation beside our numbers, see :func:`relations`."""
 
 
 def relations(entries: Sequence[Entry], setting: Setting = "main") -> list[Relation]:
-    """Say whether the paper's relations hold in some evaluated runs, one evaluation of each.
+    """Say whether the paper's relations hold in some evaluated runs, one evaluation of each: for :data:`STEPS` each
+    metric, then :data:`FACTORS`.
 
     Seeds of a method are averaged; errors are of the paired differences between run segments (the linearised error of
     a factor), clustered by recording. Divergences are compared without their bias by sampling.
 
     Returns:
-        For each statement ``metric``, ``before``, ``after``, ``does`` and ``text``; ``value``, the factor or the
+        For each relation ``metric``, ``before``, ``after``, ``text`` and what it ``does``: a factor, or where the
+        paper's data sets agree and one of them clearly, "falls" or "rises", else None; ``value``, the factor or the
         difference, ``se``, and ``paper``, the same of its figures by data set; ``held`` (None where it can't be said,
-        as something is ``missing``); ``clear``, whether the value is :data:`CLEAR` errors away from the bound.
+        as the paper has no direction, or something is ``missing``); ``clear``, whether the value is :data:`CLEAR`
+        errors away from the bound.
 
     Raises:
         ConfigError: a method was simulated in several ways.
         DataError: an evaluation lacks a number that is needed.
     """
-    methods, papers = (
-        by_method(entries),
-        {name: paper_figures(setting, name) for name in get_args(PaperData)},
-    )
+    methods = by_method(entries)
+    papers = {name: rows for name in get_args(PaperData) if (rows := paper_figures(setting, name))}
     found = []
-    for metric, before, after, does in STATEMENTS:
-        ends = {name: [rows[m][metric][0] for m in (before, after)] for name, rows in papers.items() if rows}
-        paper = {k: a / b if isinstance(does, float) else b - a for k, (a, b) in ends.items()}
-        verb = does if isinstance(does, str) else f"falls at least {does:g} times" if does > 1 else "falls"
-        verb += ", beyond sampling" * (metric == "curvature_jsd")
+    claims: list[tuple[str, str, str, float | None]] = [(m, *step, None) for step in STEPS for m in METRICS]
+    for metric, before, after, factor in claims + list(FACTORS):
+        ends = {name: [rows[m][metric] for m in (before, after)] for name, rows in papers.items()}
+        paper = {name: a / b if factor else b - a for name, ((a, _), (b, _)) in ends.items()}
+        does = factor or _direction(list(ends.values()))
+        verb = "changes" if does is None else does if isinstance(does, str) else f"falls at least {does:g} times"
         text = f"{method_name(before)} to {method_name(after)}: {COLUMNS[metric].title} {verb}"
         one: Relation = {"metric": metric, "before": before, "after": after, "does": does, "text": text}
-        one |= {
-            "paper": paper,
-            "held": None,
-            "clear": False,
-            "value": math.nan,
-            "se": math.nan,
-            "missing": "",
-        }
+        one |= {"paper": paper, "held": None, "clear": False, "value": math.nan, "se": math.nan, "missing": ""}
         if absent := [method_name(method) for method in (before, after) if method not in methods]:
             one["missing"] = f"no runs of {' and '.join(absent)}"
         else:
             _check(one, methods[before], methods[after])
         found.append(one)
     return found
+
+
+def _direction(ends: Sequence[Sequence[tuple[float, float]]]) -> str | None:
+    """Return the direction in which the paper's data sets agree, if it is clear in one of them."""
+    away = [(b - a, math.hypot(first, second)) for (a, first), (b, second) in ends]
+    if not any(abs(value) > CLEAR * error for value, error in away):
+        return None
+    signs = {math.copysign(1.0, value) for value, _ in away}
+    return None if len(signs) > 1 else "rises" if signs == {1.0} else "falls"
 
 
 def _check(one: Relation, before: Sequence[Entry], after: Sequence[Entry]) -> None:
@@ -127,8 +123,8 @@ def _check(one: Relation, before: Sequence[Entry], after: Sequence[Entry]) -> No
     away = value - does if isinstance(does, float) else value if does == "rises" else -value
     clear = abs(away) > CLEAR * error  # never of none against few, whose error is not known
     # What stays the same does not fall.
-    held = away > 0 or (away == 0 and does not in ("falls", "rises", 1.0))
-    one |= {"held": held and (clear or not sampled), "clear": clear, "value": value, "se": error}
+    held = away > 0 or (away == 0 and isinstance(does, float))
+    one |= {"held": None if does is None else held, "clear": clear, "value": value, "se": error}
 
 
 def by_method(entries: Sequence[Entry]) -> dict[str, list[Entry]]:
@@ -185,21 +181,27 @@ def paired_lines(entries: Sequence[Entry], base: str) -> list[str]:
 
 
 def relations_text(found: Sequence[Relation]) -> str:
-    """Return relations as a table: what is claimed, ours, the paper's, whether it is held."""
-    grid = [["", "here", "paper, own data", "paper, WOMD", "is it so?"]]
+    """Return relations as a table of the steps, a line for each, and one of the factors."""
+    steps: dict[str, list[str]] = {}
+    factors = [["", "here", *(f"paper, {name}" for name in get_args(PaperData))]]
     for one in found:
-        column = COLUMNS[one["metric"]]
-        factor = isinstance(one["does"], float)
+        column, factor = COLUMNS[one["metric"]], isinstance(one["does"], float)
         form, scale = ("{:.1f}", 1.0) if factor else (f"{{:+.{column.digits}f}}", column.scale)
-        unit = "times" if factor else column.unit.replace("%", "points")
         error = "" if math.isnan(one["se"]) else f" ± {form.replace('+', '').format(one['se'] * scale)}"
-        here = one["missing"] or f"{form.format(one['value'] * scale)}{error} {unit}"
-        theirs = (one["paper"].get(name, math.nan) * scale for name in get_args(PaperData))
-        paper = ["–" if math.isnan(value) else form.format(value) for value in theirs]
-        verdict = "not known" if one["held"] is None else "held" if one["held"] else "not held"
-        within = "" if one["held"] is None or one["clear"] else ", within the error"
-        grid.append([one["text"], here, *paper, verdict + within])
-    return markdown(grid)
+        here = "–" if one["missing"] else form.format(one["value"] * scale) + error + mark(one)
+        if factor:
+            paper = [one["paper"].get(name, math.nan) for name in get_args(PaperData)]
+            factors.append([one["text"], here, *("–" if math.isnan(each) else f"{each:.1f}" for each in paper)])
+        else:
+            steps.setdefault(one["text"].partition(":")[0], []).append(here)
+    titles = [f"{COLUMNS[metric].title} {COLUMNS[metric].unit.replace('%', 'points')}".strip() for metric in METRICS]
+    grid = [["", *titles], *([name, *row] for name, row in steps.items())]
+    return f"{markdown(grid)}\n{markdown(factors)}"
+
+
+def mark(one: Relation) -> str:
+    """Return how a number stands to the paper: as there, the other way, or within its error of the bound."""
+    return "" if one["held"] is None else " ≈" if not one["clear"] else " ✓" if one["held"] else " ✗"
 
 
 def main(args: Sequence[str] | None = None) -> None:
