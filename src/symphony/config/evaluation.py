@@ -38,7 +38,7 @@ MOST_SECONDS = 1e6
 
 def compiles(choice: Compile, device: str, searches: int) -> bool:
     """Return whether the steps of this many searches (or batches of rollouts) are compiled on a device."""
-    return choice == "yes" or (choice == "auto" and device != "cpu" and searches >= SEARCHES)
+    return choice == "yes" or (choice == "auto" and not device.startswith("cpu") and searches >= SEARCHES)
 
 
 def check_planner_seconds(seconds: float) -> None:
@@ -129,7 +129,7 @@ class EvaluateConfig(SimulationConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.engine == "ray" and self.device != "cpu":
+        if self.engine == "ray" and not self.device.startswith("cpu"):
             raise ConfigError(f"engine 'ray' works on CPUs only, device is '{self.device}'")
         if self.rollouts % self.trees:
             raise ConfigError(f"rollouts ({self.rollouts}) must be a multiple of trees ({self.trees})")

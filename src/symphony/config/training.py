@@ -165,7 +165,7 @@ class TrainConfig(RunConfig):
         as no update learns from states :data:`AGE` updates old, and checkpoints come between searches.
         """
         each, every = min(self.segments, segments), self.search.updates
-        most = 1 if self.device == "cpu" else min(ROWS // each, AGE // every, segments // each)
+        most = 1 if self.device.startswith("cpu") else min(ROWS // each, AGE // every, segments // each)
         fits = (k for k in range(most, 1, -1) if self.checkpoint_every % (k * every) == 0)
         return each * (min(self.together, segments // each) or next(fits, 1))
 
