@@ -180,7 +180,7 @@ def paired_lines(entries: Sequence[Entry], base: str) -> list[str]:
     return lines
 
 
-def relations_text(found: Sequence[Relation]) -> str:
+def tables(found: Sequence[Relation]) -> tuple[list[list[str]], list[list[str]]]:
     """Return relations as a table of the steps, a line for each, and one of the factors."""
     steps: dict[str, list[str]] = {}
     factors = [["", "here", *(f"paper, {name}" for name in get_args(PaperData))]]
@@ -195,8 +195,7 @@ def relations_text(found: Sequence[Relation]) -> str:
         else:
             steps.setdefault(one["text"].partition(":")[0], []).append(here)
     titles = [f"{COLUMNS[metric].title} {COLUMNS[metric].unit.replace('%', 'points')}".strip() for metric in METRICS]
-    grid = [["", *titles], *([name, *row] for name, row in steps.items())]
-    return f"{markdown(grid)}\n{markdown(factors)}"
+    return [["", *titles], *([name, *row] for name, row in steps.items())], factors
 
 
 def mark(one: Relation) -> str:
@@ -221,7 +220,7 @@ def main(args: Sequence[str] | None = None) -> None:
     found = relations(entries, given.setting)
     if given.json is not None:
         write_json(given.json, found)
-    print(relations_text(found))
+    print(*map(markdown, tables(found)), sep="\n")
 
 
 if __name__ == "__main__":
