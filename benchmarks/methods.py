@@ -2,8 +2,8 @@
 
     python benchmarks/methods.py RUN ... --towns NAME ... --roads NAME ...
 
-Each run has an evaluation on both test parts; NAME is how its file begins. Errors are over recordings, after the
-seeds of a method were averaged; the relations are those of the towns (see ``relations.py``).
+Each run has an evaluation on both test parts; NAME is how its file begins. The relations are those of the towns (see
+``relations.py``).
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ import numpy as np
 
 from relations import by_method, relations, tables
 from symphony.config import Method
-from symphony.evaluation.table import BASELINES, COLUMNS, Entry, collect, compare, method_name, paper_figures
-from symphony.metrics.intervals import clustered_mean
+from symphony.evaluation.table import BASELINES, COLUMNS, collect, compare, method_name, paper_figures
 
 RECORDS = Path(__file__).resolve().parents[1] / "results"
 TOWNS, ROADS = ("collision_rate", "offroad_time", "ade", "min_sade"), ("collision_rate", "ade", "min_sade")
@@ -32,20 +31,12 @@ def digits(key: str) -> int:
     return 1 if key == "collision_rate" else COLUMNS[key].digits
 
 
-def means(entries: Sequence[Entry], keys: Sequence[str]) -> list[list[float]]:
-    """Return means and standard errors of runs of a method; collisions are those between states, too."""
-    runs: list[Any] = [{row["segment"]: row for row in entry.record["per_segment"]} for entry in entries]  # type: ignore[union-attr]
-    member = np.unique([row["group"] for row in runs[0].values()], return_inverse=True)[1]
-    numbers = np.array([[[run[name][key] for name in runs[0]] for key in keys] for run in runs]).mean(0)
-    return [
-        [round(x, digits(key)) for x in clustered_mean(row, member)] for key, row in zip(keys, numbers, strict=True)
-    ]
-
-
-def baseline(entry: Entry, name: str, keys: Sequence[str]) -> list[list[float]]:
-    """Return the same of a baseline."""
-    found: Any = entry.record[name]
-    return [[round(found[key], digits(key)), round(found[f"{key}_se"], digits(key))] for key in keys]
+def numbers(records: Sequence[Any], keys: Sequence[str]) -> list[list[float]]:
+    """Return means and their errors over recordings, averaged over the runs of a method: seeds share the recordings,
+    so that more of them hardly lower the error. Collisions are those between states, too.
+    """
+    averages = [[np.mean([record[name] for record in records]) for name in (key, f"{key}_se")] for key in keys]
+    return [[round(float(each), digits(key)) for each in pair] for key, pair in zip(keys, averages, strict=True)]
 
 
 def write(name: str, of: str, columns: list[list[Any]], rows: list[list[Any]]) -> None:
@@ -75,10 +66,12 @@ def main(args: Sequence[str] | None = None) -> None:
     of_towns, of_roads, paper = by_method(towns), by_method(roads), paper_figures("main", "womd")
     rows: list[list[Any]] = []
     for name, title in BASELINES.items():
-        rows.append([title, *baseline(towns[0], name, TOWNS), *baseline(roads[0], name, ROADS), *["–"] * len(PAPER)])
+        both = (numbers([each[0].record[name]], keys) for each, keys in ((towns, TOWNS), (roads, ROADS)))
+        rows.append([title, *(cell for cells in both for cell in cells), *["–"] * len(PAPER)])
     for method in (method for method in get_args(Method) if method in paper and method in of_towns):
-        own = [*means(of_towns[method], TOWNS), *means(of_roads[method], ROADS)]
-        rows.append([method_name(method), *own, *(list(paper[method][key]) for key in PAPER)])
+        own = (numbers([e.record for e in of[method]], keys) for of, keys in ((of_towns, TOWNS), (of_roads, ROADS)))
+        theirs = [list(paper[method][key]) for key in PAPER]
+        rows.append([method_name(method), *(cell for cells in own for cell in cells), *theirs])
     heads = [("towns", TOWNS), ("real roads", ROADS), ("paper", PAPER)]
     shown = {"collision_rate": "collisions %", "offroad_time": "off-road %", "ade": "ADE m", "min_sade": "minSADE m"}
     columns = [
