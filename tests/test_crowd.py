@@ -131,6 +131,8 @@ def test_the_edge_is_where_lanes_end_not_where_one_joins_another():
     lines = [*main, np.stack([xs, 0 * xs - LANE_WIDTH], -1)]
     road = make_road(lines, successors=[(0, 1)], left=[(2, 0)], right=[(0, 2)])
     assert np.allclose(map_edge(LaneGraph(road)).exits, [[200, 0, 1, 0]])
+    # Nor is there one where there are no lanes, and traffic is open all the same.
+    assert map_edge(LaneGraph(make_road([lines[0][:1]]))).hull.tolist() == [[0, 0, 0]]
 
 
 @settings(max_examples=3)
