@@ -131,6 +131,8 @@ def test_the_edge_is_where_lanes_end_not_where_one_joins_another():
     lines = [*main, np.stack([xs, 0 * xs - LANE_WIDTH], -1)]
     road = make_road(lines, successors=[(0, 1)], left=[(2, 0)], right=[(0, 2)])
     assert np.allclose(map_edge(LaneGraph(road)).exits, [[200, 0, 1, 0]])
+    # Nor is there one where there are no lanes, and traffic is open all the same.
+    assert map_edge(LaneGraph(make_road([lines[0][:1]]))).hull.tolist() == [[0, 0, 0]]
 
 
 @settings(max_examples=3)
@@ -180,7 +182,8 @@ def test_routes_begin_where_an_agent_comes_in():
     x, time = np.arange(0, 202, 2.0), DT * np.arange(51)
     places = np.stack([50 + 10 * time, -60 + 10 * time])
     position, velocity = (np.stack([part, 0 * places], -1) for part in (places, np.full_like(places, 10.0)))
-    scenes = crowded(make_segment(make_road([np.stack([x, 0 * x], -1)]), position, 0 * places, velocity))
+    across = np.where(places < [[-99], [10]], 2.0, 0.0)  # nor is it while it comes across
+    scenes = crowded(make_segment(make_road([np.stack([x, 0 * x], -1)]), position, across, velocity))
     assert int(scenes.enter[0, 1]) > 0
     assert (scenes.route_logged >= 0).all()
     assert scenes.route_count[0, 1, 0] > 1

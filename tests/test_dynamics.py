@@ -86,6 +86,7 @@ def test_greedy_fit_follows_smooth_driving():
     path, size, valid = drive(0)
     actions, fitted = Bicycle().fit(path, valid, size, DT)
     assert actions.shape == (8, 50)
+    assert not Bicycle().fit(path * torch.tensor([1, 1, 1, -1]), valid, size, DT)[1][:, 0, 3].any()  # none reverses
     error = (fitted - path)[..., :2].norm(dim=-1)
     assert error.max() < 0.25
     assert error[:, -1].mean() < 0.15
@@ -110,6 +111,8 @@ def test_fit_starts_anew_where_an_agent_reappears(dynamics):
     _, fitted = dynamics.fit(hidden, valid, size, DT)
     torch.testing.assert_close(fitted[:, 30], path[:, 30])
     assert (fitted - path)[:, 30:, :2].norm(dim=-1).max() < 0.25
+    gap = fitted[:, 19:30, 2:]  # they keep course and speed
+    torch.testing.assert_close(gap, gap[:, :1].expand_as(gap), atol=1e-4, rtol=0)
 
 
 @given(st.floats(3, 25), st.floats(-3, 3), st.integers(0, 146))

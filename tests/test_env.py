@@ -141,8 +141,8 @@ def test_moving_the_world_changes_nothing_an_agent_sees(dynamics):
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
 def test_padded_interactive_agents_neither_act_nor_matter(dynamics):
     two, three = scene(crossing(6), [0, 1]), scene(straight_road(4), [0, 1, 2])
-    alone = DrivingEnv(collate([two]), dynamics, ALL)
-    padded = DrivingEnv(collate([two, three]), dynamics, ALL)
+    config = replace(ALL, clearance=dynamics.discrete)  # off the road by what is seen, or not
+    alone, padded = (DrivingEnv(collate(scenes), dynamics, config) for scenes in ([two], [two, three]))
     plan = actions(padded, (1, 20))
     a = run(alone, alone.start(torch.tensor([0])), plan[:, :, :2])
     start = padded.start(torch.tensor([0]))
@@ -207,6 +207,9 @@ def test_constant_velocity_keeps_its_speed_and_course():
         # On a straight road at constant speeds that is the log itself.
         truth = torch.from_numpy(straight_road().position[:2, 50, :2])
         torch.testing.assert_close(now[keys.STATE][0, :, :2], truth, atol=0.01, rtol=0)
+        # Who comes in reverse begins at rest: none of the actions reverses.
+        back = make_env(straight_road().replace(velocity=-straight_road().velocity), dynamics=dynamics)
+        assert not back.start(torch.tensor([0]))[keys.STATE][..., 3].any()
 
 
 NOTHING = ObservationConfig.nothing()
@@ -350,8 +353,9 @@ def test_lights_keep_their_last_state_after_the_log_however_long_others_are():
         now = env.start(torch.tensor([0]))
         for _ in range(7):
             now = env.step(now.set(keys.ACTION, torch.full((1, 1), 73)))["next"]
-        points, mask = (now["agents", "observation", name] for name in ("points", "points_mask"))
-        found.append(points[mask])
+        seen = now["agents", "observation"]
+        found.append(seen["points"][seen["points_mask"]])
+        assert not seen["objects_mask"].any()
     assert torch.equal(*found)
 
 

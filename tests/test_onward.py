@@ -202,15 +202,15 @@ def pile_up():
 
 @pytest.mark.parametrize("after", ["go-on", "stop", "remove", "respawn"])
 def test_what_becomes_of_agents_that_collide(after):
-    segment = pile_up()
-    scenes = scene(segment, [0, 1, 2, 3], edge=map_edge(LaneGraph(segment.road)))
+    graph = LaneGraph((segment := pile_up()).road)
+    scenes = scene(segment, [0, 1, 2, 3], graph, edge=map_edge(graph))
     env = DrivingEnv(scenes, None, ObservationConfig.nothing(), after_collision=after)
-    now, seen = env.start(torch.zeros(1, dtype=torch.int64)), []
+    now, seen = env.with_goals(env.start(torch.zeros(1, dtype=torch.int64))), []
     for _ in range(20):
         seen.append(now)
         now = env.step(now.set(keys.ACTION, torch.full((1, 4), 73)))["next"]
-    read = (keys.COLLISION, keys.VALID, keys.STATE)
-    hit, there, state = (torch.stack([one[key] for one in seen])[:, 0] for key in read)
+    read = (keys.COLLISION, keys.VALID, keys.STATE, keys.PROGRESS)
+    hit, there, state, come = (torch.stack([one[key] for one in seen])[:, 0] for key in read)
     hit, first = hit.squeeze(-1), int(hit.any(1).int().argmax())
     assert (first > 0, hit[first].tolist()) == (True, [False, True, True, False])
     assert (there & ~hit)[:, [0, 3]].all()
@@ -227,6 +227,7 @@ def test_what_becomes_of_agents_that_collide(after):
         assert back > 0
         assert torch.equal(state[later][back, 1, :2], state[0, 1, :2])
         assert there[later][back, 1]
+        assert come[first, 1] > come[later][back, 1] == 0
 
 
 def test_wrong_settings_are_refused():

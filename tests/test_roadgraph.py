@@ -126,6 +126,9 @@ def test_starting_lanes_around_a_junction():
     # Cutting into a turn, a vehicle may be nearer to another connector than to its own by a metre.
     wide = starting_lanes(graph, [1.5, -4.5], np.radians(110))
     assert {k for k, _ in wide} >= {name["left0"], name["ahead0"]}
+    # A circuit leads into itself, and there is nothing else to be on at its seam.
+    ring = LaneGraph(make_road({"a": arc((0, 0), 30, 0, 360)}, [("a", "a")])[0])
+    assert (ring.successors, starting_lanes(ring, [30, 0], np.pi / 2)) == ([(0,)], [(0, 0)])
 
 
 def movement(graph, name, kind, k, **options):
@@ -232,10 +235,7 @@ def test_agrees_with_the_definition(make):
     assert hits > 10
 
 
-Reals = NDArray[np.float64]
-
-
-def bend(turns: float, radius: float = 20.0, length: float = 189.0) -> Reals:
+def bend(turns: float, radius: float = 20.0, length: float = 189.0) -> NDArray[np.float64]:
     """A straight line, or one that goes around a circle of the given radius, in points 3 m apart."""
     arc = np.arange(0.0, length + 1e-9, 3.0)
     if not turns:

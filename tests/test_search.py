@@ -236,9 +236,10 @@ def test_an_included_agent_drives_where_doubles_are_the_default():
         torch.set_default_dtype(torch.float32)
 
 
-def test_agents_that_need_routes_and_have_none_say_so(dataset, scenes):
+@pytest.mark.parametrize("what", ["route", "along"])
+def test_agents_that_need_routes_and_have_none_say_so(dataset, scenes, what):
     bare = SceneDataset(dataset.store, 2, Bicycle())
-    sees, blind = ObservationConfig(num_objects=2, num_points=0, route=True), ObservationConfig.nothing()
+    sees, blind = ObservationConfig(num_objects=2, num_points=0, **{what: True}), ObservationConfig.nothing()
     with pytest.raises(ConfigError, match=r"routes=True"):
         DrivingEnv(bare, Bicycle(), sees)
     for source in (bare, bare.scenes(range(2))):

@@ -123,7 +123,8 @@ class DrivingEnv(EnvBase):
         self.source: SceneSource | None = None if isinstance(scenes, SceneBatch) else scenes
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.observation = ObservationConfig() if observation is None else observation
-        if self.observation.route and not getattr(scenes, "routes", True):
+        self._follows = self.observation.route or self.observation.along
+        if self._follows and not getattr(scenes, "routes", True):
             raise ConfigError(NO_ROUTES)
         self.reward = penalty if reward is None else reward
         self.ends_on, self.after_collision = tuple(EVENTS[name] for name in ends_on), after_collision
@@ -303,7 +304,7 @@ class DrivingEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         now = self._read(tensordict)
-        if self.observation.route and not self._followed and has_values():
+        if self._follows and not self._followed and has_values():
             if bool((now.goal < 0).all()):
                 raise ConfigError(NO_GOALS)
             self._followed = now.goal.device.type != "cpu"  # where looking waits, once is enough
@@ -374,8 +375,7 @@ class DrivingEnv(EnvBase):
         scenes, shape = self.scenes, now.scene.shape
         row, at = now.scene.flatten(), now.step.flatten()
         moved, real, goal, progress = _flat(len(shape), now.state, now.valid, now.goal, now.progress)
-        follows = self.observation.route or self.observation.along
-        along: dict[str, Tensor] = {"goal": goal, "progress": progress} if follows else {}
+        along: dict[str, Tensor] = {"goal": goal, "progress": progress} if self._follows else {}
         seen, objects = observe_states(scenes, row, at, moved, real, self.observation, tables=self._kept(), **along)
         index = scenes.interactive.index_select(0, row)
         with torch.no_grad():

@@ -21,8 +21,6 @@ from symphony.geometry.boxes import box_corners
 from symphony.geometry.frames import levels_apart
 from symphony.geometry.nearest import nearest, on_host
 
-__all__ = ["OBJECT_FEATURES", "POINT_FEATURES"]
-
 SELF_FEATURES = 4
 REPAID = 2  # positions in a cell that repay a list of its points
 _DISTANCES = 1 << 16  # distances held at a time

@@ -85,8 +85,10 @@ def map_edge(graph: LaneGraph) -> MapEdge:
     corners = np.asarray(shapely.orient_polygons(outline).exterior.coords)
     side = np.diff(corners, axis=0)
     normal = np.stack([side[:, 1], -side[:, 0]], -1) / np.linalg.norm(side, axis=-1, keepdims=True)
-    hull = np.concatenate([normal, (normal * corners[:-1]).sum(-1, keepdims=True)], -1)
-    return MapEdge(np.array(exits, np.float32).reshape(-1, 4), hull.astype(np.float32))
+    hull = np.concatenate([normal, (normal * corners[:-1]).sum(-1, keepdims=True)], -1).astype(np.float32)
+    # Without lanes nobody is beyond a side of zeros, which says that traffic is open there, too.
+    hull = hull if len(hull) else np.zeros((1, 3), np.float32)
+    return MapEdge(np.array(exits, np.float32).reshape(-1, 4), hull)
 
 
 def beyond(position: NDArray[np.floating], edge: MapEdge) -> NDArray[np.bool_]:

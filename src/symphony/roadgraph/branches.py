@@ -70,8 +70,8 @@ def starting_lanes(
         if distance <= near.distance.min() + MARGIN or graph.usable_lanes[k] == best
     }
     past = {k for k in found if found[k][1] >= graph.length[k] - 1e-6}
-    gone = {k for k in past if any(s in found for s in graph.successors[k])}
-    gone |= {s for k in found.keys() - past for s in graph.successors[k] if s in found and found[s][1] <= 1e-6}
+    pairs = [(k, s) for k in found for s in graph.successors[k] if s in found.keys() - {k}]
+    gone = {k for k, _ in pairs if k in past} | {s for k, s in pairs if k not in past and found[s][1] <= 1e-6}
     kept = sorted(found.keys() - gone, key=lambda k: (k != best, round(found[k][0], 3), k))
     return [(k, found[k][1]) for k in kept]
 

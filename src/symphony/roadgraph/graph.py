@@ -130,8 +130,10 @@ class LaneGraph:
     """
 
     def __init__(self, road: Any, *, exclude: Collection[int] = (BIKE_LANE,)) -> None:
-        points = np.asarray(road.lanes.points, dtype=np.float64)[:, :2]
-        self.lines = [_distinct(points[a:b]) for a, b in pairwise(road.lanes.offsets)]
+        points, offsets = np.asarray(road.lanes.points, dtype=np.float64)[:, :2], road.lanes.offsets
+        new = np.insert((points[1:] != points[:-1]).any(1), 0, True)
+        new[offsets[:-1]] = True
+        self.lines = [points[a:b][new[a:b]] for a, b in pairwise(offsets)]
         self.arc = [arc_lengths(line) for line in self.lines]
         self.length: Reals = np.array([arc[-1] for arc in self.arc], dtype=np.float64)
         self.usable: Bools = ~np.isin(np.asarray(road.lane_type), list(exclude)) & (self.length > 0)
@@ -190,7 +192,9 @@ class LaneGraph:
         pairs = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)
         if len(pairs) and (pairs.min() < 0 or pairs.max() >= len(self)):
             raise DataError(f"names a lane outside the {len(self)} lanes", field=field)
-        pairs = np.unique(pairs[self.usable[pairs].all(1) & (pairs[:, 0] != pairs[:, 1])], axis=0)
+        # A circuit leads into itself, but no lane lies beside itself.
+        fits = (pairs[:, 0] != pairs[:, 1]) | (field == "road.successors")
+        pairs = np.unique(pairs[self.usable[pairs].all(1) & fits], axis=0)
         ends = np.searchsorted(pairs[:, 0], np.arange(len(self) + 1))
         return [tuple(pairs[a:b, 1].tolist()) for a, b in pairwise(ends)]
 
@@ -199,8 +203,3 @@ class LaneGraph:
         parent, lane = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
         entry = np.array([self.lines[k][0] for k in lane], dtype=np.float64).reshape(-1, 2)
         return Regions(lane, parent, self.curvature[lane], entry, self.start_heading[lane])
-
-
-def _distinct(line: Reals) -> Reals:
-    keep = np.concatenate(([True], (line[1:] != line[:-1]).any(1)))[: len(line)]
-    return line[keep]
