@@ -186,7 +186,8 @@ def test_what_can_not_be_right_is_refused():
         Backtrack(math.nan)
 
 
-def test_who_has_ended_stays_so_where_others_go_back():
+@pytest.mark.parametrize(("until", "apart"), [(True, True), (True, False), (False, True)])
+def test_who_has_ended_stays_so_where_others_go_back(until, apart):
     """Agent 0 leaves in the first step; agent 1 is bad at steps 5 and 6 until the line has gone back."""
     start = branch(with_rows(Mass(agents=2), [1]).reset(), 1)
     start["agents", "place"] = torch.tensor([[[[1.45, 0.5], [0.0, 0.0]]]])
@@ -194,13 +195,16 @@ def test_who_has_ended_stays_so_where_others_go_back():
 
     def score(td: TensorDictBase) -> Tensor:
         bad = next(calls) in {5, 6}
-        return torch.tensor([0.1, 9.0 if bad else 0.1]).expand(*td.shape, 2)
+        each = torch.tensor([0.1, 9.0 if bad else 0.1]).expand(*td.shape, 2)
+        return each if apart else each.sum(-1)
 
     actions = torch.tensor([[-0.6], [0.0]])
     still = TensorDictModule(lambda x: actions.expand(*x.shape[:-1], 1), [("agents", "place")], [ACTION])
-    found = beam_search(Mass(agents=2), still, score, start, steps=8, prune_every=2, rule=Backtrack(5.0, back=(1,)))
+    how: Any = {"steps": 8, "prune_every": 2, "rule": Backtrack(5.0, back=(1,))}
+    found = beam_search(Mass(agents=2), still, score, start, until_done=until, **how)
     assert next(calls) > 9
-    torch.testing.assert_close(found.scores[0, 0, :, 0], torch.tensor([0.1, *[0.0] * 7]))
+    if until and apart:
+        torch.testing.assert_close(found.scores[0, 0, :, 0], torch.tensor([0.1, *[0.0] * 7]))
 
 
 @pytest.mark.filterwarnings("ignore:Nested TransformedEnvs:UserWarning")
@@ -213,16 +217,11 @@ def test_random_actions_go_back_too(rows):
 
 
 def test_as_a_collector():
-    frames = 3 * 4 * 10
-    collector = BeamSearchCollector(
-        *(with_rows(Walk(), [3]), Policy()),
-        **{"score": far, "branches": 4, "leaves": 4, "prune_every": 2, "rule": RULE, "prepare": give_streams},
-        **{"frames_per_batch": frames, "total_frames": 2 * frames},
-    )
+    how = {"score": far, "branches": 4, "leaves": 4, "prune_every": 2, "rule": RULE, "prepare": give_streams}
+    collector = BeamSearchCollector(with_rows(Walk(), [3]), Policy(), frames_per_batch=120, total_frames=240, **how)
     batches = list(collector)
     assert [batch.shape for batch in batches] == [(3, 4, 10)] * 2
     for batch in batches:
         assert torch.equal(batch.get(("next", *X))[..., :-1, :, :], batch.get(X)[..., 1:, :, :])
         assert torch.equal(batch.get(("collector", "beam_slot")), torch.arange(4)[:, None].expand(3, 4, 10))
-    assert collector.simulated_frames > 2 * frames
-    collector.shutdown()
+    assert collector.simulated_frames > 240
