@@ -200,7 +200,7 @@ def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:
     """
     base, transforms = parts_of(env)
     _check_shape(base, base.batch_size if state is None else state.shape)
-    if state is None or base in _PASSED or (getattr(base, "branchable", False) and not transforms):
+    if state is None or env in _PASSED or (getattr(base, "branchable", False) and not transforms):
         return
     one = state[..., :1]
     trial = branched_env(env, one.shape, share=False)
@@ -216,7 +216,7 @@ def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:
         # A device may add up in another order each time.
         if not torch.allclose(results[1].get(key), value, rtol=1e-4, atol=1e-5, equal_nan=True):
             raise _refusal(env, f"gave another {key!r} when stepped from the same state again")
-    _PASSED.add(base)
+    _PASSED.add(env)
 
 
 def _refusal(env: EnvBase, why: str) -> ValueError:
