@@ -169,15 +169,13 @@ def test_marks_of_the_tree():
     for row, leaf, step in itertools.product(range(3), range(4), range(12)):
         slot = found.slots[row, step // 4, leaf]
         assert_same(found.tree[row, slot, step], found.trajectories[row, leaf, step])
-    scores = found.scores.unflatten(2, (3, 4)).transpose(1, 2)
-    assert_close(found.leaf_totals, collectors.max_then_sum(scores))
+    assert_close(found.leaf_totals, collectors.max_then_sum(found.scores.unflatten(2, (3, 4)).transpose(1, 2)))
 
 
 def test_leaves_are_the_best_and_distinct():
     start = starts(Walk(), 5, branches=6)
     whole, best = search(start), search(start, leaves=4)
-    # three survivors, each twice
-    assert_same(best.trajectories, whole.trajectories[:, :4])
+    assert_same(best.trajectories, whole.trajectories[:, :4])  # three survivors, each twice
     assert_close(best.slots, whole.slots[..., :4])
     assert_close(best.scores, whole.scores[:, :4])
     free, chosen = (search(start, rule=collectors.KeepAll(), leaves=leaves) for leaves in (None, 6))
@@ -266,7 +264,7 @@ def test_aggregates_by_hand():
     ({"rule": lambda totals, noise: 1 / 0}, "ZeroDivisionError: division by zero"),
     ({"rule": lambda totals, noise: totals.argsort(-1)[:, :2]}, "int64"),
     ({"rule": lambda totals, noise: totals.argsort(-1) + 1}, "outside"),
-    ({"rule": lambda totals, noise: totals.argsort(-1) - 1}, "outside"),
+    ({"rule": lambda totals, noise: totals.argsort(-1) - 1}, "outside"), ({"value": distance}, "values must be"),
     ({"score": lambda td: td.get(X)}, "scores must be"), ({"aggregate": lambda scores: scores.sum()}, "aggregate"),
 ])  # fmt: skip
 def test_contradictions_are_errors(changes, message):
