@@ -249,11 +249,10 @@ def test_two_workers_fill_a_replay_buffer_with_data_of_their_own():
 def test_workers_that_nobody_seeded_draw_apart():
     how = {"score": KeyScore("reward", negate=True), "branches": 4, "rule": Systematic(1.0)}
     collectors, pendulums = [], lambda: with_rows(PendulumEnv(), [ROWS])
-    how["frames_per_batch"] = FRAMES
     for worker in range(2):
         with torch.random.fork_rng([]):
             torch.manual_seed(0)
-            collectors.append(BeamSearchCollector(pendulums, worker_idx=worker, **how))
+            collectors.append(BeamSearchCollector(pendulums, worker_idx=worker, frames_per_batch=FRAMES, **how))
     start = TensorDict(batch_size=[ROWS, 4])
     assert not torch.equal(*(collector.rule_noise(start) for collector in collectors))
     firsts = [collector.next() for collector in collectors]

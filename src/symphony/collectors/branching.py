@@ -205,11 +205,11 @@ def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:
     one = state[..., :1]
     trial = branched_env(env, one.shape, share=False)
     with torch.no_grad():
-        with _same_numbers(trial):
+        with same_numbers(trial):
             acting = trial.rand_action(one.copy())
         results = []
         for _ in range(2):
-            with _same_numbers(trial):
+            with same_numbers(trial):
                 recall(trial, one)
                 results.append(trial.step(acting.copy()).get("next"))
     for key, value in results[0].items(True, True):
@@ -228,7 +228,7 @@ def _refusal(env: EnvBase, why: str) -> ValueError:
 
 
 @contextmanager
-def _same_numbers(env: EnvBase) -> Iterator[None]:
+def same_numbers(env: EnvBase) -> Iterator[None]:
     """Restore the global random generators and the environment's, as if nothing had been drawn."""
     held = [value for part in env.modules() for value in vars(part).values()]
     own = [value for value in held if isinstance(value, torch.Generator)]
