@@ -1,4 +1,4 @@
-"""Beam search over simulated futures of environments that keep their state in the TensorDict (paper, section IV-A).
+"""Beam search over simulated futures of environments that keep their state in the TensorDict (paper, section III-A).
 
 S branches of each row are simulated side by side. After every T_p steps each gets a total, aggregated from the
 scores of its steps and agents; the branches with *high* totals are dropped and the others copied into the free slots.
@@ -58,7 +58,7 @@ class BeamSearchResult:
             ``accumulate`` the totals of their whole histories, and their values.
         log_weights: [*b, P, S] before each pruning, minus the totals since the row was last resampled, by the
             temperature; None unless the rule is a :class:`Systematic`, like the following.
-        leaf_log_weights: [*b, L] those after the last pruning, relative to the mean weight; 0 where it resampled.
+        leaf_log_weights: [*b, L] after the last pruning, relative to the mean weight; 0 if resampled without a value.
         log_evidence: [*b] estimate of the logarithm of the mean weight of unpruned branches, whose exponential has no
             bias: of the evidence, where totals are negative log-likelihoods and the temperature is 1.
     """
