@@ -130,8 +130,8 @@ def test_the_course_of_a_line():
     places, simulated = course(rule, lambda step, tries: step == 9)
     assert places == [(8, 1), (4, 2), (0, 3), (0, 4)]
     assert simulated == 20 + 2 * (1 + 3 + 5 + 5)
-    # 1 + 3 of 10 periods are more than the cap.
-    assert course(replace(rule, cap=0.3), lambda step, tries: step == 9)[0] == [(8, 1), (4, 2)]
+    # 1 + 3 of 10 periods are the cap.
+    assert course(replace(rule, cap=0.4), lambda step, tries: step == 9)[0] == [(8, 1), (4, 2)]
 
 
 def test_agents_that_can_do_no_better_are_excused_and_hide_no_others():
@@ -166,7 +166,9 @@ def test_what_cannot_be_met_ends(cap):
     found = look(start, rule, score=lambda state: (distance(state) > -1).float())
     assert plain <= found.simulated_steps <= plain * (2 + cap)
     assert (found.totals == 2).all()
-    late = look(start, rule, score=lambda state: (state.get("step") == 12).expand(*state.shape, 2).float())
+    at_the_end: Any = {"score": lambda state: (state.get("step") == 12).expand(*state.shape, 2).float()}
+    late = look(start, rule, **at_the_end)
+    assert look(start, rule, steps=11, **at_the_end).simulated_steps == 3 * 2 * 11  # before it
     assert plain * (1 + cap) <= late.simulated_steps <= plain * (2 + cap)
     assert (late.totals[..., -1, :] == 2).all()
     # NaN is bad, as for rules that prune.
@@ -179,11 +181,9 @@ def test_what_can_not_be_right_is_refused():
         look(start, keep=[STREAM, *OUTCOME])
     with pytest.raises(ValueError, match="rule Backtrack"):
         look(start, leaves=1)
-    for wrong in ({"back": ()}, {"back": (0, 1)}, {"back": (1, -1)}, {"cap": -1.0}, {"width": 0}):
-        with pytest.raises(ValueError, match="back and width begin at 1"):
-            Backtrack(0.0, **wrong)
-    with pytest.raises(ValueError, match="threshold is a number"):
-        Backtrack(math.nan)
+    for wrong in [(0, ()), (0, (0, 1)), (0, (1, -1)), (0, (1,), -1.0), (0, (1,), 6.0, None, 0), (math.nan,)]:
+        with pytest.raises(ValueError, match="back and width begin at 1, cap at 0, and the threshold is a number"):
+            Backtrack(*wrong)
 
 
 @pytest.mark.parametrize(("until", "apart"), [(True, True), (True, False), (False, True)])

@@ -185,13 +185,13 @@ def test_leaves_are_the_best_and_distinct():
 def test_a_rule_may_mix_groups():
     """Branches of a bad group take over the goal of the branch they are copied from; several numbers are one goal."""
     generator, key = torch.Generator().manual_seed(0), ("agents", "goal")
-    goals = torch.randint(3, (3, 6, 2), generator=generator)
-    start = starts(Walk(), 3, branches=6).set(key, goals)
-    noise = torch.rand(3, 3, generator=generator)
+    goals = torch.randint(3, (20, 6, 2), generator=generator)
+    start = starts(Walk(), 20, branches=6).set(key, goals)
+    noise = torch.rand(20, 3, generator=generator)
     found = search(start, rule=collectors.ReplaceBad(2.0), group_key=key, noise=noise)
     groups, mixed = goals, 0
     for parents, totals in zip(found.parents.unbind(1), found.totals.unbind(1), strict=True):
-        after = groups.gather(1, parents[..., None].expand(3, 6, 2))
+        after = groups.gather(1, parents[..., None].expand(20, 6, 2))
         good = totals <= 2.0
         for row, slot in (~good & good.any(1, True)).nonzero().tolist():
             same = ((groups[row] == groups[row, slot]).all(-1) & good[row]).any()
@@ -199,7 +199,7 @@ def test_a_rule_may_mix_groups():
             mixed += not bool(same)
         groups = after
     assert mixed > 0
-    kept = goals.gather(1, found.slots[:, 0][..., None].expand(3, 6, 2))
+    kept = goals.gather(1, found.slots[:, 0][..., None].expand(20, 6, 2))
     assert torch.equal(found.trajectories.get(key)[:, :, -1], kept)
     assert torch.equal(groups, kept)
 

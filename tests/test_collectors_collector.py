@@ -56,13 +56,14 @@ def test_best_leaf_and_its_search():
 
 
 def test_same_seed_same_data():
-    def data(seed):
+    def data(seed, fake=False):
         collector = make(rule=Systematic(0.5))
         following = collector.set_seed(seed)
+        assert not fake or collector.fake_tensordict().shape == (ROWS, STEPS)
         drawn = collector.rule_noise(TensorDict(batch_size=[4, 2]))  # the numbers of the rule are seeded, too
         return torch.cat([batch.exclude("collector") for batch in collector]), drawn, following
 
-    (first, drawn, seed), (again, redrawn, same), (other, others, another) = data(0), data(0), data(1)
+    (first, drawn, seed), (again, redrawn, same), (other, others, another) = data(0), data(0, True), data(1)
     assert_same(first, again)
     assert torch.equal(drawn, redrawn)
     assert seed == same != another
@@ -74,12 +75,12 @@ def test_reloading():
     first = make(policy=Policy())
     next(iter(first))
     state = pickle.loads(pickle.dumps(first.state_dict()))  # noqa: S301
-    changed = Policy()
-    changed.gain.data.fill_(0.5)
-    second = make(policy=changed)
+    second = make()
+    second.policy.gain.data.fill_(0.5)
     second.load_state_dict(state)
     assert_close(second.policy.gain, first.policy.gain)
     assert second.simulated_frames == first.simulated_frames > 0
+    assert torch.equal(*(each.rule_noise(TensorDict(batch_size=[4, 2])) for each in (first, second)))
     ids = [batch.get(("collector", "traj_ids")).unique() for batch in second]
     assert len(ids) == 2
     assert min(int(i.min()) for i in ids) >= 2 * ROWS
