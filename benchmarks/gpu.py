@@ -28,7 +28,7 @@ from symphony.learning import SceneDataset
 from symphony.objectives import BCLoss
 from symphony.rollouts.search import search
 
-PAPER = 16  # branches of a search when it is evaluated (paper, section V-A)
+PAPER = 16  # branches of a search when it is evaluated (paper, section III-A)
 
 
 def seconds(work: Callable[[], Any], device: torch.device, rounds: int) -> tuple[float, float]:

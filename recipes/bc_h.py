@@ -1,4 +1,4 @@
-"""Behavioural cloning with goals: the row "BC+H" of the paper's tables (sections III-B and IV-B)."""
+"""Behavioural cloning with goals: the row "BC+H" of the paper's tables (section III-B)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Behavioural cloning with tree search: the row "BC+TS" of the paper's tables (section IV-A)."""
+"""Behavioural cloning with tree search: the row "BC+TS" of the paper's tables (section III-A)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Behavioural cloning with tree search and goals: the row "BC+TS+H" of the paper's tables (section IV)."""
+"""Behavioural cloning with tree search and goals: the row "BC+TS+H" of the paper's tables (section III)."""
 
 from __future__ import annotations
 

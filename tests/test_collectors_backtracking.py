@@ -130,8 +130,8 @@ def test_the_course_of_a_line():
     places, simulated = course(rule, lambda step, tries: step == 9)
     assert places == [(8, 1), (4, 2), (0, 3), (0, 4)]
     assert simulated == 20 + 2 * (1 + 3 + 5 + 5)
-    # 1 + 3 of 10 periods are more than the cap.
-    assert course(replace(rule, cap=0.3), lambda step, tries: step == 9)[0] == [(8, 1), (4, 2)]
+    # 1 + 3 of 10 periods are the cap.
+    assert course(replace(rule, cap=0.4), lambda step, tries: step == 9)[0] == [(8, 1), (4, 2)]
 
 
 def test_agents_that_can_do_no_better_are_excused_and_hide_no_others():
@@ -166,7 +166,9 @@ def test_what_cannot_be_met_ends(cap):
     found = look(start, rule, score=lambda state: (distance(state) > -1).float())
     assert plain <= found.simulated_steps <= plain * (2 + cap)
     assert (found.totals == 2).all()
-    late = look(start, rule, score=lambda state: (state.get("step") == 12).expand(*state.shape, 2).float())
+    at_the_end: Any = {"score": lambda state: (state.get("step") == 12).expand(*state.shape, 2).float()}
+    late = look(start, rule, **at_the_end)
+    assert look(start, rule, steps=11, **at_the_end).simulated_steps == 3 * 2 * 11  # before it
     assert plain * (1 + cap) <= late.simulated_steps <= plain * (2 + cap)
     assert (late.totals[..., -1, :] == 2).all()
     # NaN is bad, as for rules that prune.
@@ -179,14 +181,13 @@ def test_what_can_not_be_right_is_refused():
         look(start, keep=[STREAM, *OUTCOME])
     with pytest.raises(ValueError, match="rule Backtrack"):
         look(start, leaves=1)
-    for wrong in ({"back": ()}, {"back": (0, 1)}, {"back": (1, -1)}, {"cap": -1.0}, {"width": 0}):
-        with pytest.raises(ValueError, match="back and width begin at 1"):
-            Backtrack(0.0, **wrong)
-    with pytest.raises(ValueError, match="threshold is a number"):
-        Backtrack(math.nan)
+    for wrong in [(0, ()), (0, (0, 1)), (0, (1, -1)), (0, (1,), -1.0), (0, (1,), 6.0, None, 0), (math.nan,)]:
+        with pytest.raises(ValueError, match="back and width begin at 1, cap at 0, and the threshold is a number"):
+            Backtrack(*wrong)
 
 
-def test_who_has_ended_stays_so_where_others_go_back():
+@pytest.mark.parametrize(("until", "apart"), [(True, True), (True, False), (False, True)])
+def test_who_has_ended_stays_so_where_others_go_back(until, apart):
     """Agent 0 leaves in the first step; agent 1 is bad at steps 5 and 6 until the line has gone back."""
     start = branch(with_rows(Mass(agents=2), [1]).reset(), 1)
     start["agents", "place"] = torch.tensor([[[[1.45, 0.5], [0.0, 0.0]]]])
@@ -194,13 +195,16 @@ def test_who_has_ended_stays_so_where_others_go_back():
 
     def score(td: TensorDictBase) -> Tensor:
         bad = next(calls) in {5, 6}
-        return torch.tensor([0.1, 9.0 if bad else 0.1]).expand(*td.shape, 2)
+        each = torch.tensor([0.1, 9.0 if bad else 0.1]).expand(*td.shape, 2)
+        return each if apart else each.sum(-1)
 
     actions = torch.tensor([[-0.6], [0.0]])
     still = TensorDictModule(lambda x: actions.expand(*x.shape[:-1], 1), [("agents", "place")], [ACTION])
-    found = beam_search(Mass(agents=2), still, score, start, steps=8, prune_every=2, rule=Backtrack(5.0, back=(1,)))
+    how: Any = {"steps": 8, "prune_every": 2, "rule": Backtrack(5.0, back=(1,))}
+    found = beam_search(Mass(agents=2), still, score, start, until_done=until, **how)
     assert next(calls) > 9
-    torch.testing.assert_close(found.scores[0, 0, :, 0], torch.tensor([0.1, *[0.0] * 7]))
+    if until and apart:
+        torch.testing.assert_close(found.scores[0, 0, :, 0], torch.tensor([0.1, *[0.0] * 7]))
 
 
 @pytest.mark.filterwarnings("ignore:Nested TransformedEnvs:UserWarning")
@@ -213,16 +217,11 @@ def test_random_actions_go_back_too(rows):
 
 
 def test_as_a_collector():
-    frames = 3 * 4 * 10
-    collector = BeamSearchCollector(
-        *(with_rows(Walk(), [3]), Policy()),
-        **{"score": far, "branches": 4, "leaves": 4, "prune_every": 2, "rule": RULE, "prepare": give_streams},
-        **{"frames_per_batch": frames, "total_frames": 2 * frames},
-    )
+    how = {"score": far, "branches": 4, "leaves": 4, "prune_every": 2, "rule": RULE, "prepare": give_streams}
+    collector = BeamSearchCollector(with_rows(Walk(), [3]), Policy(), frames_per_batch=120, total_frames=240, **how)
     batches = list(collector)
     assert [batch.shape for batch in batches] == [(3, 4, 10)] * 2
     for batch in batches:
         assert torch.equal(batch.get(("next", *X))[..., :-1, :, :], batch.get(X)[..., 1:, :, :])
         assert torch.equal(batch.get(("collector", "beam_slot")), torch.arange(4)[:, None].expand(3, 4, 10))
-    assert collector.simulated_frames > 2 * frames
-    collector.shutdown()
+    assert collector.simulated_frames > 240

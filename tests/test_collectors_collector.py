@@ -56,13 +56,14 @@ def test_best_leaf_and_its_search():
 
 
 def test_same_seed_same_data():
-    def data(seed):
+    def data(seed, fake=False):
         collector = make(rule=Systematic(0.5))
         following = collector.set_seed(seed)
+        assert not fake or collector.fake_tensordict().shape == (ROWS, STEPS)
         drawn = collector.rule_noise(TensorDict(batch_size=[4, 2]))  # the numbers of the rule are seeded, too
         return torch.cat([batch.exclude("collector") for batch in collector]), drawn, following
 
-    (first, drawn, seed), (again, redrawn, same), (other, others, another) = data(0), data(0), data(1)
+    (first, drawn, seed), (again, redrawn, same), (other, others, another) = data(0), data(0, True), data(1)
     assert_same(first, again)
     assert torch.equal(drawn, redrawn)
     assert seed == same != another
@@ -74,12 +75,12 @@ def test_reloading():
     first = make(policy=Policy())
     next(iter(first))
     state = pickle.loads(pickle.dumps(first.state_dict()))  # noqa: S301
-    changed = Policy()
-    changed.gain.data.fill_(0.5)
-    second = make(policy=changed)
+    second = make()
+    second.policy.gain.data.fill_(0.5)
     second.load_state_dict(state)
     assert_close(second.policy.gain, first.policy.gain)
     assert second.simulated_frames == first.simulated_frames > 0
+    assert torch.equal(*(each.rule_noise(TensorDict(batch_size=[4, 2])) for each in (first, second)))
     ids = [batch.get(("collector", "traj_ids")).unique() for batch in second]
     assert len(ids) == 2
     assert min(int(i.min()) for i in ids) >= 2 * ROWS
@@ -249,11 +250,10 @@ def test_two_workers_fill_a_replay_buffer_with_data_of_their_own():
 def test_workers_that_nobody_seeded_draw_apart():
     how = {"score": KeyScore("reward", negate=True), "branches": 4, "rule": Systematic(1.0)}
     collectors, pendulums = [], lambda: with_rows(PendulumEnv(), [ROWS])
-    how["frames_per_batch"] = FRAMES
     for worker in range(2):
         with torch.random.fork_rng([]):
             torch.manual_seed(0)
-            collectors.append(BeamSearchCollector(pendulums, worker_idx=worker, **how))
+            collectors.append(BeamSearchCollector(pendulums, worker_idx=worker, frames_per_batch=FRAMES, **how))
     start = TensorDict(batch_size=[ROWS, 4])
     assert not torch.equal(*(collector.rule_noise(start) for collector in collectors))
     firsts = [collector.next() for collector in collectors]

@@ -82,15 +82,11 @@ def test_the_evidence_is_that_of_kalmans_filter(threshold):
     y, evidence, mean = observed(40)
     y, evidence, mean = (part.repeat_interleave(10, 0) for part in (y, evidence, mean))
     found = filtered(y, collectors.Systematic(threshold=threshold), 128, prune_last=False)
-    assert found.log_evidence is not None
-    assert found.leaf_log_weights is not None
-    assert found.sample_size is not None
     ratio = (found.log_evidence - evidence).exp()
     if threshold:  # else one weight is all there is, and no mean of a thousand tells a bias
         assert abs(float(ratio.mean()) - 1) < 4 * float(ratio.std()) / math.sqrt(len(ratio))
         assert float(ratio.std()) < 1.0
-        share = torch.softmax(found.leaf_log_weights, -1)
-        error = (share * found.trajectories["next", "x"][..., -1, 0]).sum(-1) - mean
+        error = (found.leaf_log_weights.softmax(-1) * found.trajectories["next", "x"][..., -1, 0]).sum(-1) - mean
         assert float(error.square().mean().sqrt()) < 0.15
     torch.testing.assert_close(found.leaf_log_weights.exp().mean(-1), torch.ones(len(y), dtype=torch.float64))
     assert (found.sample_size >= 1 - 1e-6).all()
@@ -108,13 +104,13 @@ def test_a_value_looks_ahead_without_a_bias():
 
     def value(td: TensorDictBase) -> Tensor:
         coming = td["y"].gather(-1, td["t"].clamp_max(STEPS - 1))
-        ahead = 0.2 * (coming - KEPT * td["x"]).square().squeeze(-1)
-        return torch.where(td["t"].squeeze(-1) < STEPS, ahead, 0.0)
+        return 0.2 * (coming - KEPT * td["x"]).square().squeeze(-1)
 
-    found = filtered(y, collectors.Systematic(), 128, value=value)
-    assert found.log_evidence is not None
+    found = filtered(y, collectors.Systematic(), 128, value=value, leaves=128)
     ratio = (found.log_evidence - evidence).exp()
     assert abs(float(ratio.mean()) - 1) < 4 * float(ratio.std()) / math.sqrt(len(ratio))
+    left = 0.2 * (y[:, -1:] - KEPT * found.trajectories["next", "x"][..., -1, 0]).square().double()
+    torch.testing.assert_close(found.leaf_log_weights, left - left.exp().mean(-1, keepdim=True).log())
 
 
 @pytest.mark.parametrize("rule", [collectors.Systematic(threshold=0.5), collectors.KeepBest()], ids=repr)
@@ -175,6 +171,11 @@ def test_a_value_is_zero_where_all_have_terminated_one_after_the_other():
     each = [Mass(agents=2, sticky=sticky, limit=1.45) for sticky in (False, True)]
     loose, lasting = (collectors.beam_search(env, policy, score, start, **how).leaf_costs for env in each)
     assert torch.equal(loose, lasting)
+    start = collectors.branch(collectors.with_rows(Mass(limit=0.6), [9]).reset(), 4)
+    score, how = collectors.KeyScore("reward"), {**how, "prune_every": 1, "accumulate": True}
+    found = collectors.beam_search(Mass(limit=0.6), hashed, score, start, **how)
+    ended = found.trajectories["next", "terminated"].any(-2).squeeze(-1)  # whose values are copied with them
+    torch.testing.assert_close(found.leaf_costs, found.leaf_totals.sum(-2) + torch.where(ended, 0.0, 5.0))
 
 
 def test_ends_change_nothing_where_they_are_not_to():
@@ -291,9 +292,7 @@ def test_replace_bad_by_hand(branches, threshold, noise, grouped):
 
 
 def test_bad_parameters_are_errors():
-    best, systematic = collectors.KeepBest, collectors.Systematic
-    for rule, value in ((best, 0.0), (best, 1.1), (best, math.nan), (systematic, 0.0)):
-        with pytest.raises(ValueError, match=r"fraction|temperature"):
+    best, systematic, replace = collectors.KeepBest, collectors.Systematic, collectors.ReplaceBad
+    for rule, value in ((best, 0.0), (best, 1.1), (best, math.nan), (systematic, 0.0), (replace, math.nan)):
+        with pytest.raises(ValueError, match=r"fraction|temperature|threshold"):
             rule(value)
-    with pytest.raises(ValueError, match="threshold"):
-        collectors.ReplaceBad(math.nan)

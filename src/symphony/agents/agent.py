@@ -27,7 +27,7 @@ RADIUS = 20.0  # metres around an agent that its discriminator observes
 
 
 def dynamics_of(spec: AgentSpec) -> Bicycle | Displacement:
-    """Return the action space of an agent: MGAIL needs a differentiable one (paper, section V-A)."""
+    """Return the action space of an agent: MGAIL needs a differentiable one (paper, section III-C)."""
     return Displacement() if spec.action_space == "displacement" else bicycle(spec.agent)
 
 

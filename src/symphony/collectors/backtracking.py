@@ -149,27 +149,28 @@ def follow(
             those = torch.where(ending, total(judged, short)[:, 0], those)
             worst = torch.where(ending[:, None], counted[:, :short].amax(1), worst)
         simulated = simulated + every * len(line) - ending.sum() * (every - short)
-        alive = run.alive
+        alive, period = run.alive[:, 0].any(-1), line * periods + at
         if history is None:
             nowhere = line.new_zeros(lines * length)
             history = take(run.records[0], nowhere)
             all_scores, all_totals = run.scores[:, 0, 0][nowhere], totals[nowhere[: lines * periods]]
-            all_alive = alive[:, 0, 0][nowhere]
-        place = (line * periods + at) * every
-        for k, record in enumerate(run.records):
+            all_alive, all_over = alive[:, 0][nowhere], over[nowhere[: lines * periods]]
+        for place, record in enumerate(run.records):
             for key in record.keys(True, True):
-                history.get(key).index_copy_(0, place + k, record.get(key).flatten(0, 1))
-            all_scores.index_copy_(0, place + k, run.scores[:, 0, k])
-            all_alive.index_copy_(0, place + k, alive[:, 0, k])
-        all_totals.index_copy_(0, line * periods + at, totals)
+                history.get(key).index_copy_(0, period * every + place, record.get(key).flatten(0, 1))
+            all_scores.index_copy_(0, period * every + place, run.scores[:, 0, place])
+            all_alive.index_copy_(0, period * every + place, alive[:, place])
+        all_totals.index_copy_(0, period, totals)
+        all_over.index_copy_(0, period, over)
         # An episode that has ended can't be bad any more; a line that goes back goes to before its end.
-        bad = ~(those <= rule.threshold) & alive[:, 0, 0].any(-1) & ~excused.all(-1)
+        bad = ~(those <= rule.threshold) & alive[:, 0] & ~excused.all(-1)
         goes = course.judge(line, bad, ~(worst < worst.amax(-1, keepdim=True))).nonzero().squeeze(-1)
         now, over = run.after.select(*entries), run.ended
         if len(goes):
             who = line[goes]
-            first = ((who * periods + course.at[who]) * every)[:, None]
-            root, over = take(history.exclude("next"), first), over.index_copy(0, goes, ~all_alive[first])
+            first = who * periods + course.at[who]
+            root = take(history.exclude("next"), every * first[:, None])
+            over = over.index_copy(0, goes, all_over[first])
             root = root if rule.renew is None else rule.renew(root, course.times[who])
             now = _with_rows(now, goes, root, entries)
         on = (course.at[line] < periods).nonzero().squeeze(-1)
@@ -185,7 +186,7 @@ def follow(
     return (
         take(history, order),
         take_values(all_scores, order, 1),
-        take_values(all_alive, order, 1).any(-1),
+        take_values(all_alive, order, 1),
         all_totals.reshape(*start.shape, periods).transpose(-1, -2),
         int(simulated),
     )

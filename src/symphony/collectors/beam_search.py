@@ -1,4 +1,4 @@
-"""Beam search over simulated futures of environments that keep their state in the TensorDict (paper, section IV-A).
+"""Beam search over simulated futures of environments that keep their state in the TensorDict (paper, section III-A).
 
 S branches of each row are simulated side by side. After every T_p steps each gets a total, aggregated from the
 scores of its steps and agents; the branches with *high* totals are dropped and the others copied into the free slots.
@@ -58,7 +58,7 @@ class BeamSearchResult:
             ``accumulate`` the totals of their whole histories, and their values.
         log_weights: [*b, P, S] before each pruning, minus the totals since the row was last resampled, by the
             temperature; None unless the rule is a :class:`Systematic`, like the following.
-        leaf_log_weights: [*b, L] those after the last pruning, relative to the mean weight; 0 where it resampled.
+        leaf_log_weights: [*b, L] after the last pruning, relative to the mean weight; 0 if resampled without a value.
         log_evidence: [*b] estimate of the logarithm of the mean weight of unpruned branches, whose exponential has no
             bias: of the evidence, where totals are negative log-likelihoods and the temperature is 1.
     """
@@ -291,17 +291,22 @@ class Simulation:
         joined = torch.stack(scores, -2)
         if not self.until_done:
             alive = torch.ones(*joined.shape[:-1], 1, dtype=torch.bool, device=joined.device)
-            return Run(records, joined, alive, ended, now, None if self.value is None else self.value(now))
+            return Run(records, joined, alive, ended, now, None if self.value is None else self._valued(now))
         over = torch.stack(ends, -2).cumsum(-2) > 0
-        ahead = None if self.value is None else self._worth(self.value, states, over.all(-1))
+        ahead = None if self.value is None else self._worth(states, over.all(-1))
         alive = ~over[..., :-1, :]
         if alive.shape[-1] not in (1, joined.shape[-1]):
             alive = alive.any(-1, keepdim=True)
         return Run(records, torch.where(alive, joined, 0.0), alive, over[..., -1, :], now, ahead)
 
-    def _worth(
-        self, value: Score, states: Sequence[TensorDictBase], over: Bool[Tensor, "*b S _"]
-    ) -> Float[Tensor, "*b S"]:
+    def _valued(self, state: TensorDictBase) -> Float[Tensor, "*b S"]:
+        assert self.value is not None  # noqa: S101  (not asked for otherwise)
+        found = self.value(state)
+        if found.shape != state.shape:
+            raise ValueError(f"values must be {[*state.shape]}, are {[*found.shape]}")
+        return found
+
+    def _worth(self, states: Sequence[TensorDictBase], over: Bool[Tensor, "*b S _"]) -> Float[Tensor, "*b S"]:
         """Return the values of the states that branches came to, or ended in: 0 if that terminated their episodes."""
         came, steps = states[-1], len(states)
         if bool(over[..., -1].any()):
@@ -311,7 +316,7 @@ class Simulation:
         # The flag of one that ended may not last; what follows the end of all does not count.
         each = torch.stack([_ended(self.env, state, over.ndim - 1, "terminated") for state in states], -2)
         terminated = (each & ~over[..., :-1, None]).any(-2) | _ended(self.env, came, over.ndim - 1, "terminated")
-        return torch.where(terminated.all(-1), 0.0, value(came))
+        return torch.where(terminated.all(-1), 0.0, self._valued(came))
 
     def total(self, run: Run, length: int | None = None) -> Float[Tensor, "*b S"]:
         """Return the totals of a period, or of its first steps alone."""

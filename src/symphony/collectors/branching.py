@@ -200,23 +200,23 @@ def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:
     """
     base, transforms = parts_of(env)
     _check_shape(base, base.batch_size if state is None else state.shape)
-    if state is None or base in _PASSED or (getattr(base, "branchable", False) and not transforms):
+    if state is None or env in _PASSED or (getattr(base, "branchable", False) and not transforms):
         return
     one = state[..., :1]
     trial = branched_env(env, one.shape, share=False)
     with torch.no_grad():
-        with _same_numbers(trial):
+        with same_numbers(trial):
             acting = trial.rand_action(one.copy())
         results = []
         for _ in range(2):
-            with _same_numbers(trial):
+            with same_numbers(trial):
                 recall(trial, one)
                 results.append(trial.step(acting.copy()).get("next"))
     for key, value in results[0].items(True, True):
         # A device may add up in another order each time.
         if not torch.allclose(results[1].get(key), value, rtol=1e-4, atol=1e-5, equal_nan=True):
             raise _refusal(env, f"gave another {key!r} when stepped from the same state again")
-    _PASSED.add(base)
+    _PASSED.add(env)
 
 
 def _refusal(env: EnvBase, why: str) -> ValueError:
@@ -228,7 +228,7 @@ def _refusal(env: EnvBase, why: str) -> ValueError:
 
 
 @contextmanager
-def _same_numbers(env: EnvBase) -> Iterator[None]:
+def same_numbers(env: EnvBase) -> Iterator[None]:
     """Restore the global random generators and the environment's, as if nothing had been drawn."""
     held = [value for part in env.modules() for value in vars(part).values()]
     own = [value for value in held if isinstance(value, torch.Generator)]

@@ -18,7 +18,7 @@ from torchrl.envs.utils import RandomPolicy
 
 from symphony.collectors.backtracking import Backtrack
 from symphony.collectors.beam_search import Aggregation, BeamSearchResult, Policy, Score, beam_search
-from symphony.collectors.branching import below, branch, branched_env, check_branching, last_name
+from symphony.collectors.branching import below, branch, branched_env, check_branching, last_name, same_numbers
 from symphony.collectors.rules import KeepBest, PruningRule, max_then_sum
 
 
@@ -126,15 +126,15 @@ class BeamSearchCollector(Collector):
         """Return the leaves of one search from a reset, [*env.batch_size, T] or [*env.batch_size, L, T]."""
         if self.pre_collect_hook is not None:
             self.pre_collect_hook()
-        found = self._searched(self.env.reset())
+        found = self._searched(self.env, self.env.reset())
         self.simulated_frames += found.simulated_steps
         return self._finish(found)
 
-    def _searched(self, rows: TensorDictBase) -> BeamSearchResult:
+    def _searched(self, env: EnvBase, rows: TensorDictBase) -> BeamSearchResult:
         start = branch(rows, self.branches)
         start = start if self.prepare is None else self.prepare(start.copy())
         how = {"steps": self.frames_per_batch, "exploration_type": self.exploration_type, **self._search}
-        return beam_search(self.env, self._acting(), self._score, start, noise=self.rule_noise(start), **how)
+        return beam_search(env, self._acting(), self._score, start, noise=self.rule_noise(start), **how)
 
     def _finish(self, found: BeamSearchResult, *, fake: bool = False) -> TensorDictBase:
         leaves, totals = found.trajectories, found.leaf_totals
@@ -219,10 +219,11 @@ class BeamSearchCollector(Collector):
     @torch.no_grad()
     def fake_tensordict(self) -> TensorDictBase:
         """Return zeros in the shape and with the entries of a batch."""
-        rng = self._rng.get_state()
+        # Of copies, or running statistics would learn from zeros.
+        env, rng = branched_env(self.env, self.env.batch_size, share=False), self._rng.get_state()
         start = self.env.fake_tensordict().exclude("next", *self.env.action_keys)
-        with torch.random.fork_rng([]):
-            batch = self._finish(self._searched(start), fake=True)
+        with same_numbers(env):
+            batch = self._finish(self._searched(env, start), fake=True)
         self._rng.set_state(rng)
         batch = batch if self.postproc is None else self.postproc(batch)
         batch = batch.exclude(*(key for key in batch.keys(True) if last_name(key).startswith("_")))

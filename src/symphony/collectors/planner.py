@@ -90,8 +90,7 @@ class BeamSearchPlanner(MPCPlannerBase):
         targets = {"action": first, "weight": weight, "value": -found.leaf_costs[..., :1]}
         tensordict.set("planner", TensorDict(targets, root.shape))
         best = roots[..., :1].reshape(*root.shape, 1, *(1,) * (first.ndim - root.ndim - 1))
-        best = best.expand(*root.shape, 1, *first.shape[root.ndim + 1 :])
-        return first.gather(root.ndim, best).squeeze(root.ndim)
+        return first.take_along_dim(best, root.ndim).squeeze(root.ndim)
 
     def _cost(self, state: TensorDictBase) -> Tensor:
         assert self.value_network is not None  # noqa: S101  (not asked for otherwise)

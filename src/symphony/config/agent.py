@@ -97,7 +97,7 @@ class SearchConfig(Settings):
 class AgentSpec(Settings):
     """All that is needed to build an agent's networks again and to simulate it as trained; kept in its folder."""
 
-    #: Kind of actions: `bicycle`, discrete ones; `displacement`, continuous ones that gradients pass (section V-A).
+    #: Kind of actions: `bicycle`, discrete ones; `displacement`, continuous ones that gradients pass (section III-C).
     action_space: ActionSpace
     dt: Positive  # Seconds per step it learned.
     duration: Natural = 0  # Seconds of a segment it learned from; 0 for all.

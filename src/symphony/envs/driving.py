@@ -56,7 +56,7 @@ class State(NamedTuple):
 
 
 class DrivingEnv(EnvBase):
-    """A batch of logged scenes in which N agents are driven by actions (paper, section III).
+    """A batch of logged scenes in which N agents are driven by actions (paper, section II-A).
 
     All simulation state is in the TensorDict: which scene (``scene``), the step, the rollout's identity (``stream``),
     the state of the interactive agents and the routes they follow. The environment holds only constants, so forking a

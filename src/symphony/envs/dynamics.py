@@ -95,7 +95,7 @@ def _quadratic(largest: float, count: int) -> list[float]:
 
 @dataclass(frozen=True)
 class Bicycle:
-    """Kinematic bicycle with a grid of discrete actions (paper, section V-A: 7 accelerations x 21 steering angles).
+    """Kinematic bicycle with a grid of discrete actions (paper, section III-C: 7 accelerations x 21 steering angles).
 
     The joint index of an action is ``acceleration_index * num_steering + steering_index``. Both grids are spaced
     quadratically, dense near coasting straight ahead: on real logs the greedy fit swings least, at equal error.

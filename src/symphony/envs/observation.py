@@ -1,4 +1,4 @@
-"""The observation of an agent (paper, section IV-C): the nearest objects, map points and lights, in its own frame.
+"""The observation of an agent (paper, section III-C): the nearest objects, map points and lights, in its own frame.
 
 Shapes: M rows (any flattened batch), N observing agents, A agents, O objects, P points of a scene, K points seen.
 """

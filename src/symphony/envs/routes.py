@@ -87,7 +87,7 @@ def drivable(segment: RunSegment, steps: int) -> float:
 
 
 def route_table(segment: RunSegment, graph: LaneGraph, agent: int, begin: int = 0) -> RouteTable:
-    """Return the routes that an agent of a segment can take, and which of them it took (paper, section IV-B).
+    """Return the routes that an agent of a segment can take, and which of them it took (paper, section III-B).
 
     They follow every branch for :data:`symphony.roadgraph.routes.HORIZON` metres, or as far as agents can drive in
     the log, and reach :data:`ONWARD` metres beyond what can be driven in the segment, unless the map ends. Where they

@@ -71,10 +71,9 @@ class Experts:
     @property
     def nbytes(self) -> int:
         """The bytes that it takes in memory."""
-        tensors = (self.agent, self.states, self.actions, self.valid, self.error, self.progress)
         tables = sum(t.points.nbytes + t.count.nbytes + t.right.nbytes for t in self.routes)
         carried = sum(line.nbytes for t in self.routes for line in t.carried.values())
-        return sum(part.nbytes for part in tensors) + tables + carried
+        return sum(getattr(self, name).nbytes for name in _TENSORS) + tables + carried
 
 
 def fit_experts(

@@ -74,17 +74,26 @@ def log_area(share: Pairs, pace: Reals, slope: Reals, reach: float) -> Reals:
     return (reach * bend * positive(x) * slope).log()
 
 
-class BoundedDisplacement(Distribution):
+class _Reachable(Distribution):
+    """A distribution over displacements, as torch and TorchRL want one."""
+
+    arg_constraints = {}  # noqa: RUF012 - the type torch declares
+    support = constraints.real_vector
+    has_rsample = True
+
+    @property
+    def deterministic_sample(self) -> Pairs:
+        """The sample that TorchRL takes without exploration."""
+        return self.mode
+
+
+class BoundedDisplacement(_Reachable):
     """Displacements [..., 2] (metres; forward, left) reachable within a step, see :func:`displaced`.
 
     Their shares of what can be reached are Gaussian numbers u, squashed; differentiable in u, parameters and bounds.
 
     ``loc`` and ``scale`` are mean and standard deviation of u; the others are as :func:`displaced` has them.
     """
-
-    arg_constraints = {}  # noqa: RUF012 - the type torch declares
-    support = constraints.real_vector
-    has_rsample = True
 
     def __init__(
         self, loc: Pairs, scale: Pairs, pace: Reals, slope: Reals, reach: float, validate_args: bool | None = None
@@ -134,11 +143,6 @@ class BoundedDisplacement(Distribution):
         """The displacement of the mean of u (the median of either component)."""
         return self.displacement(self.loc)
 
-    @property
-    def deterministic_sample(self) -> Pairs:
-        """The sample that TorchRL takes without exploration."""
-        return self.mode
-
     def log_prob(self, value: Pairs) -> Reals:
         """Return the log-density [...]; that of the nearest displacement INSIDE the bounds for others: no entropy."""
         u = self.latent(value)
@@ -155,7 +159,7 @@ def _edges(cells: int) -> tuple[float, ...]:
     return tuple(x * (0.2 + 0.8 * abs(x)) for x in unit)
 
 
-class DisplacementHistogram(Distribution):
+class DisplacementHistogram(_Reachable):
     """Displacements [..., 2] (metres; forward, left) reachable within a step, see :func:`displaced`: anywhere in one
     of F x L cells.
 
@@ -163,10 +167,6 @@ class DisplacementHistogram(Distribution):
     gradient of the mean over all cells (straight through). Logits [..., F * L] are of the cells, those of the hardest
     braking first; ``forward`` is F, between the hardest braking and the largest acceleration.
     """
-
-    arg_constraints = {}  # noqa: RUF012 - the type torch declares
-    support = constraints.real_vector
-    has_rsample = True
 
     def __init__(
         self,
@@ -249,11 +249,6 @@ class DisplacementHistogram(Distribution):
         """The middle of the likeliest cell."""
         share = self.within(self.logits.argmax(-1), self.logits.new_full((*self.batch_shape, 2), 0.5))
         return displaced(share, self.pace, self.slope, self.reach)
-
-    @property
-    def deterministic_sample(self) -> Pairs:
-        """The sample that TorchRL takes without exploration."""
-        return self.mode
 
     def log_prob(self, value: Pairs) -> Reals:
         """Return the log-density [...], that of the nearest displacement in reach where `value` is not in reach."""

@@ -154,7 +154,7 @@ def displacement_policy(
     encoder: EncoderClass = SceneEncoder,
 ) -> ProbabilisticTensorDictSequential:
     """Build an encoder, a head and a :class:`BoundedDisplacement` (the action space the paper gives to MGAIL, section
-    V-A), or a :class:`DisplacementHistogram` in its place.
+    III-C), or a :class:`DisplacementHistogram` in its place.
 
     Weights follow `torch.manual_seed`. Writes actions `[..., N, 2]` in metres, sampled with gradient
     (reparameterised) according to TorchRL's exploration type; a pair of uniform numbers under `noise_key` decides

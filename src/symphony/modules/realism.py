@@ -1,4 +1,4 @@
-"""The discriminator D(s | g): how much a state looks simulated (paper, sections II-C and IV-C)."""
+"""The discriminator D(s | g): how much a state looks simulated (paper, sections II-C and III-C)."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class MaskedLoss(LossModule):
         reduction: `"mean"` (also for None), `"sum"` or `"none"`.
         use_mask: use of the mask under the `valid` key. None: it counts where there is one, and must be there if the
             network (or the environment) reads it, too, so that no padding is trained on unnoticed. True: it must be
-            there. False: it is not read, and everything counts.
+            there. False: it is not read.
 
     Attributes:
         share_count: set where processes train together: takes a count of this process to the mean over all, so that

@@ -363,7 +363,7 @@ def _returns(lines: Float[NDArray[np.float64], "R P 2"], spacing: float) -> Bool
 def ground_truth_routes(
     lines: Sequence[Reals], trajectory: Float[NDArray[Any], "T 2"], valid: Bool[NDArray[np.bool_], " T"]
 ) -> Bool[NDArray[np.bool_], " G"]:
-    """Return the feasible routes with the smallest displacement error to the logged trajectory (paper, section IV-B).
+    """Return the feasible routes with the smallest displacement error to the logged trajectory (paper, III-B).
 
     The error is that of :func:`route_errors`. Routes whose errors are within a millimetre are equally right: those
     that diverge beyond the trajectory's end, and all of them where no step is valid. To take one of them by its place

@@ -1,4 +1,4 @@
-"""The beam search on the driving environment (paper, section IV-A)."""
+"""The beam search on the driving environment (paper, section III-A)."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def with_drawn_goals(
     goals_per: Literal["tree", "branch"] = "tree",
 ) -> TensorDictBase:
     """Return start states [*b, S] of a search, with :func:`branched_streams` and routes that the goal policy draws:
-    once for all branches of a tree (paper, section IV-B), or for each branch alone.
+    once for all branches of a tree (paper, section III-B), or for each branch alone.
     """
     start = branched_streams(start)
     first = start if goals_per == "branch" else start[..., :1]

@@ -158,7 +158,7 @@ def start_states(
 ) -> TensorDictBase:
     """Return first states [B, trees, branches] of all scenes, observed once they have their goals.
 
-    Goals are drawn by the goal policy, if there is one, or nearest to the log: once for a tree (paper, section IV-B),
+    Goals are drawn by the goal policy, if there is one, or nearest to the log: once for a tree (paper, III-B),
     or for each branch. ``fix`` gives those that agents follow, from rows [*b] of the scenes and these goals [*b, N].
     """
     device, shape = env.scenes.device, (len(env.scenes), trees, branches)

@@ -93,7 +93,7 @@ class Validator:
 
     def __call__(self, step: int, progress: Callable[[int, int], None] | None = None) -> dict[str, float]:
         """Return the numbers for the record after an update, all beginning with ``validation_``. The best agent is
-        the one whose collision rate plus off-road time is lowest (paper, section V-B).
+        the one whose collision rate plus off-road time is lowest (paper, section V-C).
         """
         with undisturbed(self.agent, self.device):
             found = evaluate(self.agent, self.dataset, self.how, progress).metrics.compute()
