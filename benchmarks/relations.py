@@ -61,7 +61,7 @@ def relations(entries: Sequence[Entry], setting: Setting = "main") -> list[Relat
 
     Returns:
         For each relation ``metric``, ``before``, ``after``, ``text`` and what it ``does``: a factor, or where the
-        paper's data sets agree and one of them clearly, "falls" or "rises", else None; ``value``, the factor or the
+        paper's data sets agree and are clear together, "falls" or "rises", else None; ``value``, the factor or the
         difference, ``se``, and ``paper``, the same of its figures by data set; ``held`` (None where it can't be said,
         as the paper has no direction, or something is ``missing``); ``clear``, whether the value is :data:`CLEAR`
         errors away from the bound.
@@ -91,12 +91,12 @@ def relations(entries: Sequence[Entry], setting: Setting = "main") -> list[Relat
 
 
 def _direction(ends: Sequence[Sequence[tuple[float, float]]]) -> str | None:
-    """Return the direction in which the paper's data sets agree, if it is clear in one of them."""
-    away = [(b - a, math.hypot(first, second)) for (a, first), (b, second) in ends]
-    if not any(abs(value) > CLEAR * error for value, error in away):
+    """Return the direction in which the paper's data sets agree, if it is clear in them together."""
+    away = [(b - a) / math.hypot(first, second) for (a, first), (b, second) in ends]
+    signs = {math.copysign(1.0, each) for each in away}
+    if len(signs) > 1 or abs(sum(away)) <= CLEAR * math.sqrt(len(away)):
         return None
-    signs = {math.copysign(1.0, value) for value, _ in away}
-    return None if len(signs) > 1 else "rises" if signs == {1.0} else "falls"
+    return "rises" if signs == {1.0} else "falls"
 
 
 def _check(one: Relation, before: Sequence[Entry], after: Sequence[Entry]) -> None:
