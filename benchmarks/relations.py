@@ -200,7 +200,7 @@ def tables(found: Sequence[Relation]) -> tuple[list[list[str]], list[list[str]]]
 
 def mark(one: Relation) -> str:
     """Return how a number stands to the paper: as there, the other way, or within its error of the bound."""
-    return "" if one["held"] is None else " ≈" if not one["clear"] else " ✓" if one["held"] else " ✗"
+    return "" if one["held"] is None else "≈" if not one["clear"] else "✓" if one["held"] else "✗"
 
 
 def main(args: Sequence[str] | None = None) -> None:
