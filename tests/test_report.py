@@ -157,6 +157,7 @@ def test_a_red_light_is_run_where_the_front_crosses_the_stop_point() -> None:
 @given(st.floats(2, 20), st.floats(0, 1), st.sampled_from([0.1, 0.2, 1.0]), st.floats(-0.5, 0.5), st.floats(0, 1))
 @settings(max_examples=25)
 @example(20, 0.6, 1.0, 0, 0)
+@example(18, 0.0, 1.0, 0.5, 0)
 def test_only_the_light_of_the_own_lane_counts(speed, phase, dt, aside, ahead) -> None:
     """Straight on beside a turning lane, whose stop point lies a little farther on."""
     road, step = crossing_road(200.0), speed * dt
