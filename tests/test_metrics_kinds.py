@@ -270,8 +270,9 @@ def test_collisions_by_hand():
     found = collisions(position, heading, size, valid, subject, at_states=True)
     assert found.tolist() == [[False, True], [False, True], [False, False]]
     assert collisions(position, heading, size, valid, subject).tolist() == [[True], [True], [False]]
-    valid[1, 1] = False
-    assert not collisions(position, heading, size, valid, subject).any()
+    for there, end in ([True, False], 4.375), ([False, True], -4.7):  # gone, or not there yet on the other side
+        valid[1], position[1, 1, 0] = torch.tensor(there), end
+        assert not collisions(position, heading, size, valid, subject).any()
 
 
 def test_on_another_level_is_so_both_before_and_after_a_step():

@@ -499,23 +499,26 @@ def test_idm_keeps_its_lane_in_turns() -> None:
 
 
 def at_a_light(mine: SignalState, others: SignalState) -> RunSegment:
-    """A car 12 m before a crossing, its own light in one state, those of the same approach's turns in another."""
+    """A car 12 m before a crossing without limits, its own light in one state, those of its approach in another."""
     segment = crossing(2, steps=61, seed=0).replace(ego=1)
     path = LineString(segment.position[1, :, :2])
     state = np.full_like(segment.signal_state, others)
     leads = [path.distance(Point(segment.road.lanes[int(lane)][6, :2])) < 0.3 for lane in segment.signal_lane]
     assert sum(leads) == 1
     state[leads] = mine
+    segment.road.speed_limit[:] = np.nan
     return segment.replace(signal_state=state)
 
 
 def test_idm_stops_at_its_own_red_light_alone() -> None:
-    red, free = at_a_light(SignalState.STOP, SignalState.GO), at_a_light(SignalState.GO, SignalState.STOP)
-    path, other = states(red, free)
+    stop, go = SignalState.STOP, SignalState.GO
+    red, free, passed, late = (at_a_light(*pair) for pair in ((stop, go), *3 * [(go, stop)]))
+    passed.signal_state[:, 30:], late.signal_state[:, 5:] = stop, SignalState.CAUTION  # too late to stop for
+    path, *others = states(red, free, passed, late)
     stop = np.linalg.norm(red.signal_point[:, :2] - path[-1, :2], axis=-1).min()
     assert path[-1, 3] < 0.1
     assert 0.5 * LENGTH < stop < 0.5 * LENGTH + 4
-    assert other[-1, 3] > 3
+    assert min(other[-1, 3] for other in others) > 3
 
 
 def test_off_the_lanes_the_run_fails() -> None:

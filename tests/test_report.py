@@ -157,6 +157,7 @@ def test_a_red_light_is_run_where_the_front_crosses_the_stop_point() -> None:
 @given(st.floats(2, 20), st.floats(0, 1), st.sampled_from([0.1, 0.2, 1.0]), st.floats(-0.5, 0.5), st.floats(0, 1))
 @settings(max_examples=25)
 @example(20, 0.6, 1.0, 0, 0)
+@example(18, 0.0, 1.0, 0.5, 0)
 def test_only_the_light_of_the_own_lane_counts(speed, phase, dt, aside, ahead) -> None:
     """Straight on beside a turning lane, whose stop point lies a little farther on."""
     road, step = crossing_road(200.0), speed * dt
@@ -189,17 +190,16 @@ def test_failed_runs_and_groups_are_told_apart(tmp_path: Path) -> None:
     hit = driving((0, 0, 0, 12), (10, 0, 0, 7), segment_id="hit")
     free = driving((0, 0, 0, 7), (10, 0, 0, 7), segment_id="free")
     with RolloutWriter(tmp_path / "sim", ABOUT) as writer:
-        writer.add(played(hit.replace(group="north"), rollouts=2))
+        writer.add(played(hit.replace(group="north"), rollouts=3, failed={2: "planner raised ValueError"}))
         writer.add(played(free.replace(group="south"), rollouts=2, failed={1: "planner raised ValueError"}))
         writer.fail("lost", 2, "no ego")
     totals = (found := report(load_rollouts(tmp_path / "sim"))).totals()
-    assert (totals["runs"], totals["failed_runs"], totals["segments"], totals["groups"]) == (6, 3, 3, 2)
-    assert totals["collision_rate"] == pytest.approx(100 * 2 / 3)
+    assert (totals["runs"], totals["failed_runs"], totals["segments"], totals["groups"]) == (7, 4, 3, 2)
+    assert (totals["collision_rate"], found.parts[0]["collisions"]) == (pytest.approx(100 * 2 / 3), 2)
     # Groups of 2 and 1 runs, all and none of which collided.
     residual = (np.array([2, 0]) - 2 / 3 * np.array([2, 1])) / 1.5
     assert totals["collision_rate_se"] == pytest.approx(100 * np.sqrt((residual**2).sum() / 2))
-    assert [row["segment"] for row in found.worst()[:3]] == ["free", "lost", "lost"]
-    assert found.worst()[3]["at_fault_collision"]
+    assert [row["segment"] for row in found.worst()[:5]] == ["hit", "free", "lost", "lost", "hit"]
     assert found.plain()["collisions"] == [
         {"kind": "into leader", "other": "vehicle", "at_fault": True, "with_playback": True, "collisions": 2}
     ]

@@ -88,8 +88,8 @@ def manoeuvres() -> list[Case]:
     return [
         Case("into one that stands", "it still moved when it came there, 3 cm before its own stand",
             stops(ego(), 0.0, 5.0), (car(40 + 10 - 0.03 + 4.5, OWN, 0.0),), hit("into leader", True)),
-        Case("into one that brakes hard", "a safe distance is for that", ego(), (stops(car(60), 0.0, 5.0),),
-            hit("into leader", True)),
+        Case("into one that brakes hard", "a safe distance is for that, though it was not seen at once", ego(),
+            (stops(car(60, there=(1.0, 99.0)), 0.0, 5.0),), hit("into leader", True)),
         Case("brakes hard and is hit", "who is behind keeps the distance, whatever the reason for braking is",
             stops(ego(), 1.0, 8.0), (car(28),), hit("rear ended", False), log=ego()),
         Case("hit while it stands", "an agent that has stopped hits nobody", stops(ego(), 0.0, 5.0),

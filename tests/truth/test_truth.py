@@ -112,11 +112,6 @@ def test_a_report_says_what_is_right(case: Case, dt: float) -> None:
         check(case, found.rows[0], found.events[case.name], saved, phase * dt)
 
 
-def test_there_are_enough_of_them() -> None:
-    names = [case.name for case in ALL]
-    assert len(names) == len(set(names)) >= 60
-
-
 def test_who_stands_on_a_bridge_is_not_drawn_as_hit() -> None:
     """The ego hits a car that stands below another."""
     others = car(165, OWN, 0.0, NORTH), car(165, OWN, 0.0, NORTH, z=6.0)

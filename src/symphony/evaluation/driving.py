@@ -134,17 +134,17 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
         for light in (passing[m].any(0) & beside).nonzero()[0]:
             at_end = along_lane[light] > 0.5 * length[light]
             part = slice(0, t + 1) if at_end else slice(t + 1, None)
-            points = world.position[evaluated[m], part][world.valid[evaluated[m], part]]
+            path = world.position[evaluated[m], part][world.valid[evaluated[m], part]]
+            # A step may be longer than the lane.
+            way = shapely.segmentize(shapely.linestrings(np.concatenate([path[:1], path])), 1.0)
+            points = shapely.get_coordinates(way)
             points = points[np.linalg.norm(points - stop[light], axis=-1) <= length[light]]
             if len(points):
                 distance = float(shapely.distance(lines[light], shapely.points(points)).mean())
                 best, least = (int(light), distance) if distance < least else (best, least)
         # One that changes just then is not held against the agent.
-        if (
-            best >= 0
-            and passing[m, t, best]
-            and np.isin(segment.signal_state[known[best], start + t : start + t + 2], RED).all()
-        ):
+        shown = segment.signal_state[known[best], start + t : start + t + 2]
+        if best >= 0 and passing[m, t, best] and np.isin(shown, RED).all():
             found.append((int(evaluated[m]), t + 1, int(known[best])))
     return Lights(*np.array(found, np.int64).reshape(-1, 3).T)
 
