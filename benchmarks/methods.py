@@ -70,15 +70,15 @@ def main(args: Sequence[str] | None = None) -> None:
         rows.append([title, *(cell for cells in both for cell in cells), *["–"] * len(PAPER)])
     for method in (method for method in get_args(Method) if method in paper and method in of_towns):
         own = (numbers([e.record for e in of[method]], keys) for of, keys in ((of_towns, TOWNS), (of_roads, ROADS)))
-        theirs = [list(paper[method][key]) for key in PAPER]
+        theirs = [paper[method][key][0] for key in PAPER]
         rows.append([method_name(method), *(cell for cells in own for cell in cells), *theirs])
     heads = [("towns", TOWNS), ("real roads", ROADS), ("paper", PAPER)]
     shown = {"collision_rate": "collisions %", "offroad_time": "off-road %", "ade": "ADE m", "min_sade": "minSADE m"}
     columns = [
         [f"{head}: {shown[key]}", 2 if head == "paper" else digits(key)] for head, keys in heads for key in keys
     ]
-    seeds = sorted({entry.seed for entry in towns})
-    of = f"the eight methods, seeds {seeds}, on the test parts of simulated towns and of NGSIM, ± over recordings"
+    seeds = ", ".join(f"{method_name(method)}: {len(mine)}" for method, mine in of_towns.items())
+    of = f"the eight methods (seeds of {seeds}), on the test parts of simulated towns and of NGSIM, ± over recordings"
     write("methods", f"{of}; beside the figures of the paper on WOMD", [[""], *columns], rows)
     head, *steps = tables(relations(towns))[0]
     write("relations", f"what differs between {of}, of towns, paired", [[title] for title in head], steps)

@@ -193,7 +193,7 @@ def tables(found: Sequence[Relation]) -> tuple[list[list[str]], list[list[str]]]
             paper = [one["paper"].get(name, math.nan) for name in get_args(PaperData)]
             factors.append([one["text"], here, *("–" if math.isnan(each) else f"{each:.1f}" for each in paper)])
         else:
-            steps.setdefault(one["text"].partition(":")[0], []).append(here)
+            steps.setdefault(one["text"].partition(":")[0].replace(" to ", "→"), []).append(here)
     titles = [f"{COLUMNS[metric].title} {COLUMNS[metric].unit.replace('%', 'points')}".strip() for metric in METRICS]
     return [["", *titles], *([name, *row] for name, row in steps.items())], factors
 
