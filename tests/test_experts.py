@@ -261,9 +261,13 @@ def test_a_label_brakes_and_turns_as_the_way_back_does(speed, acceleration, late
     size = torch.cat([LENGTH, LENGTH / 2])[None]
     found = dynamics.step(log[:1], dynamics.towards(log[:1], log[1:], size, DT), size, DT)
     torch.testing.assert_close(found[:, 3], log[1:, 3], atol=0.03, rtol=0)
+    steep = torch.tensor([0.0, 0.0, 1.2, 0.0]).to(log)
     # A step too short for its turn: one that comes to rest while the wheel is held over.
     if log[1, 3] > 2.0:
         assert wrap(found[:, 2] - log[1:, 2]).abs() < 0.01
+        # Too sharp a turn is the steepest step to its side.
+        across = [Displacement().towards(log[:1], log[1:] + turn * steep, size, DT)[0] for turn in (-1, 1)]
+        assert [(y / x.hypot(y)).item() for x, y in across] == pytest.approx([-0.3, 0.3], abs=0.02)
 
 
 def test_displacements_are_as_large_as_is_said_and_none_goes_backwards() -> None:

@@ -132,10 +132,8 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings) -
     start = history_only(segment, dt, settings.future)
     is_vehicle = start.agent_type == AgentType.VEHICLE
     graph = LaneGraph(start.road)
-    edge = map_edge(graph) if len(graph.usable_lanes) else None
-    driven = is_vehicle & ~held[rows]
-    if edge is not None:
-        driven &= ~beyond(start.position[:, 0, :2], edge)
+    edge = map_edge(graph)
+    driven = is_vehicle & ~held[rows] & ~beyond(start.position[:, 0, :2], edge)
     vehicles, people = np.flatnonzero(driven), np.flatnonzero(~is_vehicle)
     states = _extrapolated(segment, rows, settings.future)
     states[:, people] = walks(segment, rows[people], ROLLOUTS, settings.future, settings.seed)
@@ -285,7 +283,7 @@ def _driven(
     vehicles: NDArray[np.int64],
     settings: WosacSettings,
     graph: LaneGraph,
-    edge: MapEdge | None,
+    edge: MapEdge,
     log: RunSegment | None,
 ) -> Doubles:
     """Return [R, U, N, 3] x, y, heading of the vehicles; on the routes of the log, where there is one."""
