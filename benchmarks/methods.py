@@ -2,8 +2,8 @@
 
     python benchmarks/methods.py RUN ... --towns NAME ... --roads NAME ...
 
-Each run has an evaluation on both test parts; NAME is how its file begins. The relations are those of the towns (see
-``relations.py``).
+Each run has an evaluation on both test parts; NAME is how its file begins. Those of several trees, with a rollout
+of each, have rows of their own. The relations are those of the towns (see ``relations.py``).
 """
 
 from __future__ import annotations
@@ -60,18 +60,23 @@ def main(args: Sequence[str] | None = None) -> None:
     for part in ("--towns", "--roads"):
         parser.add_argument(part, nargs="+", required=True)
     given = parser.parse_args(args)
-    towns, roads = (collect(given.runs, "main", names)[0] for names in (given.towns, given.roads))
-    for entries in (towns, roads):
+    parts = [collect(given.runs, "main", names)[0] for names in (given.towns, given.roads)]
+    several = [[entry for entry in entries if entry.record["config"]["trees"] > 1] for entries in parts]
+    towns, roads = ([e for e in every if e not in more] for every, more in zip(parts, several, strict=True))
+    for entries in (towns, roads, *filter(None, several)):
         compare(entries, "main")  # fail if they are not comparable
     of_towns, of_roads, paper = by_method(towns), by_method(roads), paper_figures("main", "womd")
+    ways = [("", of_towns, of_roads), (", paper's leaves", *map(by_method, several))]
     rows: list[list[Any]] = []
     for name, title in BASELINES.items():
         both = (numbers([each[0].record[name]], keys) for each, keys in ((towns, TOWNS), (roads, ROADS)))
         rows.append([title, *(cell for cells in both for cell in cells), *["–"] * len(PAPER)])
-    for method in (method for method in get_args(Method) if method in paper and method in of_towns):
-        own = (numbers([e.record for e in of[method]], keys) for of, keys in ((of_towns, TOWNS), (of_roads, ROADS)))
+    for method in (method for method in get_args(Method) if method in paper):
         theirs = [paper[method][key][0] for key in PAPER]
-        rows.append([method_name(method), *(cell for cells in own for cell in cells), *theirs])
+        for way, *both in ((way, town, road) for way, town, road in ways if method in town):
+            records = ([entry.record for entry in of[method]] for of in both)
+            own = map(numbers, records, (TOWNS, ROADS))
+            rows.append([method_name(method) + way, *(cell for cells in own for cell in cells), *theirs])
     heads = [("towns", TOWNS), ("real roads", ROADS), ("paper", PAPER)]
     shown = {"collision_rate": "collisions %", "offroad_time": "off-road %", "ade": "ADE m", "min_sade": "minSADE m"}
     columns = [
