@@ -179,7 +179,7 @@ def beam_search(
         if isinstance(rule, Backtrack):
             if leaves not in (None, branches):
                 raise ValueError("rule Backtrack gives all branches as leaves")
-            lines = follow(simulation.run, simulation.total, start, ended, rule, steps, prune_every)
+            lines = follow(simulation.run, simulation.total, start, ended, rule, steps, min(prune_every, steps))
             return _independent(lines, prune_every, keep_tree)
         periods = [min(prune_every, steps - first) for first in range(0, steps, prune_every)]
         pruning = Pruning(start, rule, len(periods), group_key=group_key, noise=noise, accumulate=accumulate)

@@ -301,5 +301,5 @@ class KeptExperts:
                     np.save(part, array)
                     # Of no date, so that equal arrays are equal files.
                     file.writestr(zipfile.ZipInfo(f"{name}.npy"), part.getvalue(), zipfile.ZIP_DEFLATED, 1)
-        except OSError:
+        except DataError:
             self.folder = None
