@@ -441,14 +441,6 @@ def test_shorter_segments_wait_for_longer_ones(tmp_path: Path) -> None:
     assert all((a != b).any() for a, b in itertools.pairwise(right))
 
 
-def test_an_evaluation_can_be_animated(tmp_path: Path) -> None:
-    fill(tmp_path / "store", [straight_road(4, steps=5), crossing(4, seed=1, steps=7)])
-    file = tmp_path / "rollouts.gif"
-    options = ["--data", str(tmp_path / "store"), "--figure", str(file), "--rollouts", "2"]
-    assert main(["evaluate", "constant_velocity", *options]) == 0
-    assert len(durations(file)) == 7
-
-
 def records(count: int = 30, **metrics: float) -> list[dict[str, float]]:
     return [{"step": 20 * (k + 1)} | {name: x * k for name, x in metrics.items()} for k in range(count)]
 
