@@ -106,6 +106,8 @@ def manoeuvres() -> list[Case]:
         Case("the ego cut in long before",
             "more than four seconds ago: since then the one behind had time to fall back",
             ego(aside=(0.0, 0.5, -3.5)), (car(21, RIGHT, 12.0),), hit("rear ended", False, (19 - 4.5) / 2)),
+        Case("hit from behind on its way out of the lane", "its tail never left the other's path",
+            ego(6.0, x=60, aside=(2.0, 4.0, -3.5)), (car(60 - 4.5 - 8 * 3.2, OWN, 14.0),), hit("rear ended", False)),
         Case("another cuts in closely and brakes",
             "6 m ahead and slower: there is nothing that the ego could do", ego(12.0),
             (car(52, RIGHT, 8.0, aside=(0.0, 1.0, 3.5), change=(1.0, 2.0, -4.0)),), hit("into leader", False)),

@@ -18,7 +18,7 @@ from symphony.data.levels import agent_heights
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.evaluation.contacts import time_to_collision
-from symphony.geometry import levels_apart
+from symphony.geometry import box_corners, levels_apart
 from symphony.saved.folder import RolloutFolder
 from symphony.saved.rollouts import SavedRollouts, World, world_of
 
@@ -116,11 +116,8 @@ def _encroachment(world: World, segment: RunSegment, seen: NDArray[np.int64], eg
 
 def _boxes(world: World, row: NDArray[np.int64], step: NDArray[np.int64]) -> NDArray[np.object_]:
     """Return the boxes of agents at steps, as polygons."""
-    half = 0.5 * world.size[row][:, None]
-    x, y = (np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half).transpose(2, 0, 1)
-    cos, sin = (part(world.heading[row, step])[:, None] for part in (np.cos, np.sin))
-    turned = np.stack([x * cos - y * sin, x * sin + y * cos], -1)
-    polygons: NDArray[np.object_] = shapely.polygons(world.position[row, step][:, None] + turned)
+    parts = world.position[row, step], world.heading[row, step], world.size[row]
+    polygons: NDArray[np.object_] = shapely.polygons(box_corners(*map(torch.from_numpy, parts)).numpy())
     return polygons
 
 
