@@ -255,8 +255,7 @@ def _cut_in(world: World, rear: Indices, front: Indices, step: Indices, dt: floa
     start = np.take_along_axis(ours, seen.argmax(1)[:, None, None], 1)
     path = np.concatenate([np.where(seen[..., None], ours, start), onward[:, None]], 1)
     half, turned = 0.5 * world.size, world.heading[front[:, None], times]
-    sizes = np.broadcast_to(world.size[front, None], theirs.shape).copy()
-    corners = box_corners(from_numpy(theirs), from_numpy(turned), from_numpy(sizes))
+    corners = box_corners(from_numpy(theirs), from_numpy(turned), from_numpy(world.size[front, None]))
     away = shapely.distance(shapely.linestrings(path)[:, None], shapely.polygons(corners.numpy()))
     outside = seen & world.valid[front[:, None], times] & (away > half[rear, 1:])
     # The first state from which on it stays in the path.
