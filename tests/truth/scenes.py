@@ -106,6 +106,8 @@ def manoeuvres() -> list[Case]:
         Case("the ego cut in long before",
             "more than four seconds ago: since then the one behind had time to fall back",
             ego(aside=(0.0, 0.5, -3.5)), (car(21, RIGHT, 12.0),), hit("rear ended", False, (19 - 4.5) / 2)),
+        Case("hit from behind on its way out of the lane", "its tail never left the other's path",
+            ego(6.0, x=60, aside=(2.0, 4.0, -3.5)), (car(60 - 4.5 - 8 * 3.2, OWN, 14.0),), hit("rear ended", False)),
         Case("another cuts in closely and brakes",
             "6 m ahead and slower: there is nothing that the ego could do", ego(12.0),
             (car(52, RIGHT, 8.0, aside=(0.0, 1.0, 3.5), change=(1.0, 2.0, -4.0)),), hit("into leader", False)),
@@ -179,6 +181,10 @@ def rules() -> list[Case]:
     waits = stops(ego(x=100), 2.0, 5.0)  # 2 s, then 10 m: the front is at 132.25
     return [
         Case("runs a red light", "the front passes x = 150", ego(x=100), beside, {"red": 1}, light=red),
+        Case("runs a red light at once", "the front passes x = 150 in a first step", ego(x=146), (), {"red": 1},
+            light=red),
+        Case("leaves its lane past a red light", "at x = 150 the front is 1.6 m beside the middle",
+            ego(x=100, y=RIGHT, aside=(4.2417, 5.2417, -3.0), turned=False), (), {"red": 1}, light=red),
         Case("green", "no light is red", ego(x=100), beside, {"red": 0}, light=green),
         Case("red turns green before", "the front is there after 4.8 s", ego(x=100), beside, {"red": 0},
             light=((0.0, RED), (3.0, GREEN))),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -18,7 +19,7 @@ from symphony.data.levels import agent_heights
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.evaluation.contacts import time_to_collision
-from symphony.geometry import levels_apart
+from symphony.geometry import box_corners, levels_apart
 from symphony.saved.folder import RolloutFolder
 from symphony.saved.rollouts import SavedRollouts, World, world_of
 
@@ -81,26 +82,25 @@ def criticality(found: RunSegment | SavedRollouts, rollout: int | None = None) -
         world = World(position, heading, velocity, segment.valid, size, height)
     seen = np.flatnonzero(world.valid[segment.ego])
     slower = np.diff(world.speed[segment.ego, seen]) / (np.diff(seen) * segment.dt)
-    ego = _boxes(world, np.full(len(seen), segment.ego), seen)
-    boundary = segment.road.boundary
-    lines = [boundary[k][:, :2].astype(np.float64) for k in range(len(boundary)) if len(boundary[k]) > 1]
-    edges = shapely.union_all([shapely.LineString(line) for line in lines])
+    lines = [segment.road.boundary[k][:, :2] for k in range(len(segment.road.boundary))]
+    edges = shapely.union_all([shapely.LineString(line) for line in lines if len(line) > 1])
     ttc = time_to_collision(world, np.array([segment.ego]))
     return Criticality(
         segment.segment_id,
         0.0 if hits else float(ttc[ttc > 0].min(initial=math.inf)),
-        _encroachment(world, segment, seen, ego),
+        _encroachment(world, segment, seen),
         float(-slower.min(initial=0.0)) + 0.0,
-        float(shapely.distance(edges, ego).min(initial=math.inf)) if lines else math.inf,
+        float(shapely.distance(edges, _boxes(world, segment.ego, seen)).min(initial=math.inf)) if edges else math.inf,
         rollout,
     )
 
 
-def _encroachment(world: World, segment: RunSegment, seen: NDArray[np.int64], ego: NDArray[np.object_]) -> float:
+def _encroachment(world: World, segment: RunSegment, seen: NDArray[np.int64]) -> float:
     """Return the least seconds between the ego's box and that of an agent crossing its path at the same place."""
     who, step = world.valid.nonzero()
     who, step = who[who != segment.ego], step[who != segment.ego]
-    mine, theirs = shapely.STRtree(_boxes(world, who, step)).query(ego, predicate="intersects")
+    tree = shapely.STRtree(_boxes(world, who, step, swept=1))
+    mine, theirs = tree.query(_boxes(world, segment.ego, seen, swept=1), predicate="intersects")
     mine, who, step = seen[mine], who[theirs], step[theirs]
     apart = np.abs(mine - step) * segment.dt
     # A follower in a lane reaches each place soon after: that is a headway.
@@ -114,14 +114,14 @@ def _encroachment(world: World, segment: RunSegment, seen: NDArray[np.int64], eg
     return least if least <= LONGEST else math.inf
 
 
-def _boxes(world: World, row: NDArray[np.int64], step: NDArray[np.int64]) -> NDArray[np.object_]:
-    """Return the boxes of agents at steps, as polygons."""
-    half = 0.5 * world.size[row][:, None]
-    x, y = (np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half).transpose(2, 0, 1)
-    cos, sin = (part(world.heading[row, step])[:, None] for part in (np.cos, np.sin))
-    turned = np.stack([x * cos - y * sin, x * sin + y * cos], -1)
-    polygons: NDArray[np.object_] = shapely.polygons(world.position[row, step][:, None] + turned)
-    return polygons
+def _boxes(world: World, row: Any, step: NDArray[np.int64], swept: int = 0) -> NDArray[np.object_]:
+    """Return the boxes of agents at steps, or what they sweep up to the next state, as polygons."""
+    later = np.minimum(step + swept, world.valid.shape[1] - 1)
+    row, corners = np.broadcast_to(row, step.shape), []
+    for at in (step, np.where(world.valid[row, later], later, step)):
+        parts = world.position[row, at], world.heading[row, at], world.size[row]
+        corners.append(box_corners(*map(torch.from_numpy, parts)).numpy())
+    return np.asarray(shapely.convex_hull(shapely.multipoints(np.concatenate(corners, 1))))
 
 
 def hardest(

@@ -22,7 +22,7 @@ from torch import from_numpy
 
 from symphony.data.segment import AgentType
 from symphony.evaluation.driving import Bools, Heights, Indices, Lanes, Lights, Reals
-from symphony.geometry import boxes_overlap, levels_apart, meeting_time, pose_at
+from symphony.geometry import box_corners, boxes_overlap, levels_apart, meeting_time, pose_at
 from symphony.geometry.boxes import covers, relation
 from symphony.metrics import CollisionKind, meetings
 from symphony.metrics.kinds import STANDING, kind_of_contact
@@ -254,10 +254,10 @@ def _cut_in(world: World, rear: Indices, front: Indices, step: Indices, dt: floa
     # Before it was seen there is no path: it begins where it was first seen.
     start = np.take_along_axis(ours, seen.argmax(1)[:, None, None], 1)
     path = np.concatenate([np.where(seen[..., None], ours, start), onward[:, None]], 1)
-    half = 0.5 * world.size
-    away = shapely.distance(shapely.linestrings(path)[:, None], shapely.points(theirs))
-    beside = away - (half[rear, 1] + half[front, 1])[:, None]
-    outside = seen & world.valid[front[:, None], times] & (beside > 0)
+    half, turned = 0.5 * world.size, world.heading[front[:, None], times]
+    corners = box_corners(from_numpy(theirs), from_numpy(turned), from_numpy(world.size[front, None]))
+    away = shapely.distance(shapely.linestrings(path)[:, None], shapely.polygons(corners.numpy()))
+    outside = seen & world.valid[front[:, None], times] & (away > half[rear, 1:])
     # The first state from which on it stays in the path.
     entered = outside.shape[1] - outside[:, ::-1].argmax(1)
     at = np.arange(len(rear)), np.minimum(entered, outside.shape[1] - 1)

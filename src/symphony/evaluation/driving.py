@@ -106,10 +106,8 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
     lane, stop = segment.signal_lane[known], segment.signal_point[known, :2].astype(np.float64)
     lines, length = line_strings([graph.lines[each] for each in lane]), graph.length[lane]
     along_lane = shapely.line_locate_point(lines, shapely.points(stop))
-    piece = np.minimum(1.0, length)
-    begin = np.minimum(along_lane, length - piece)
-    places = [shapely.line_interpolate_point(lines, at) for at in (begin, begin + piece)]
-    ends = [shapely.get_coordinates(place) for place in places]
+    begin = np.minimum(along_lane, np.maximum(length - 1.0, 0.0))
+    ends = [shapely.get_coordinates(shapely.line_interpolate_point(lines, at)) for at in (begin, begin + 1.0)]
     direction = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0], axis=-1, keepdims=True)
     heading = world.heading[evaluated]
     forward = np.stack([np.cos(heading), np.sin(heading)], -1)
@@ -119,7 +117,9 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
     along = (away * direction).sum(-1)
     across = away[..., 1] * direction[:, 0] - away[..., 0] * direction[:, 1]
     passing = (along[:, :-1] < 0) & (along[:, 1:] >= 0) & (along[:, 1:] < max(15.0, 60.0 * segment.dt))
-    passing &= np.abs(across[:, 1:]) <= 0.5 * lanes.width[lane]
+    # Straight from state to state, the front is where it crosses the line, not where the step ends.
+    beside = np.abs(across[:, :-1] * along[:, 1:] - across[:, 1:] * along[:, :-1])
+    passing &= beside <= 0.5 * lanes.width[lane] * np.diff(along, axis=1)
     passing &= (forward[:, 1:, None] * direction).sum(-1) > math.cos(SAME_WAY)
     passing &= (world.valid[evaluated, 1:] & world.valid[evaluated, :-1])[..., None]
     if world.height is not None:
@@ -136,11 +136,11 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
             part = slice(0, t + 1) if at_end else slice(t + 1, None)
             path = world.position[evaluated[m], part][world.valid[evaluated[m], part]]
             # A step may be longer than the lane.
-            way = shapely.segmentize(shapely.linestrings(np.concatenate([path[:1], path])), 1.0)
-            points = shapely.get_coordinates(way)
-            points = points[np.linalg.norm(points - stop[light], axis=-1) <= length[light]]
+            way = shapely.linestrings(np.concatenate([path[:1], path]))
+            points = shapely.line_interpolate_point(way, np.arange(way.length + 1))
+            points = points[shapely.distance(points, shapely.points(stop[light])) <= length[light]]
             if len(points):
-                distance = float(shapely.distance(lines[light], shapely.points(points)).mean())
+                distance = float(shapely.distance(lines[light], points).mean())
                 best, least = (int(light), distance) if distance < least else (best, least)
         # One that changes just then is not held against the agent.
         shown = segment.signal_state[known[best], start + t : start + t + 2]
