@@ -135,9 +135,9 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
             at_end = along_lane[light] > 0.5 * length[light]
             part = slice(0, t + 1) if at_end else slice(t + 1, None)
             path = world.position[evaluated[m], part][world.valid[evaluated[m], part]]
-            # A step may be longer than the lane.
-            way = shapely.segmentize(shapely.linestrings(np.concatenate([path[:1], path])), 1.0)
-            points = shapely.get_coordinates(way)
+            # A step may be longer than the lane; a way without length can't be cut.
+            way = shapely.linestrings(np.concatenate([path[:1], path]))
+            points = shapely.get_coordinates(shapely.segmentize(way, 1.0) if way.length else way)
             points = points[np.linalg.norm(points - stop[light], axis=-1) <= length[light]]
             if len(points):
                 distance = float(shapely.distance(lines[light], shapely.points(points)).mean())
