@@ -456,7 +456,7 @@ def records(count: int = 30, **metrics: float) -> list[dict[str, float]]:
 def test_every_metric_has_a_panel_and_every_run_two_lines(tmp_path: Path) -> None:
     runs = {
         "one": records(discriminator_auc=0.1, policy_accuracy=1.0, mine=3.0),
-        "two": records(5, discriminator_auc=0.2, search_collision_all=1.0, search_collision_kept=0.5),
+        r"$\two$": records(5, discriminator_auc=0.2, search_collision_all=1.0, search_collision_kept=0.5),
     }
     figure = plot_curves(runs, tmp_path / "curves.png")
     drawn = {axes.get_title(loc="left"): axes.lines for axes in figure.axes}
@@ -470,7 +470,7 @@ def test_every_metric_has_a_panel_and_every_run_two_lines(tmp_path: Path) -> Non
     assert raw.get_alpha() < 0.5
     assert raw.get_linewidth() < strong.get_linewidth()
     assert raw.get_color() == strong.get_color() == AGENT_COLORS[0]
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "two"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", r"\$\two\$"]
     assert (tmp_path / "curves.png").stat().st_size > 10_000
 
 
