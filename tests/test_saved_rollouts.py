@@ -178,11 +178,12 @@ def test_damage_is_found_and_named(tmp_path):
         with pytest.raises(DataError, match=message) as caught:
             load_rollouts(tmp_path / "sim")[k]
         assert (caught.value.file, caught.value.segment) == (files[k], f"straight-{k}")
-    # A shape that nothing could hold is damage too.
-    header = b'{"state": {"dtype": "F32", "shape": [0, 4611686018427387904, 8], "data_offsets": [0, 0]}}'
-    header += b" " * (-len(header) % 8)
-    with pytest.raises(DataError, match="file one, segment one: damaged"):
-        read_tensors(len(header).to_bytes(8, "little") + header, Path("one"), "one")
+    # A shape that nothing could hold is damage too, and a list in place of the facts.
+    shape = b'{"state": {"dtype": "F32", "shape": [0, 4611686018427387904, 8], "data_offsets": [0, 0]}}'
+    for header in (shape, b'{"__metadata__": {"symphony": "[]"}}'):
+        padded = header + b" " * (-len(header) % 8)
+        with pytest.raises(DataError, match="file one, segment one: damaged"):
+            read_tensors(len(padded).to_bytes(8, "little") + padded, Path("one"), "one")
     broken = played(straight_road())
     broken.state[0, 3] = np.nan
     with pytest.raises(DataError, match="not finite"):  # nor is it written

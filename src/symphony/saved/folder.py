@@ -308,7 +308,7 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
     if "log_weight" in arrays:
         raise DataError("is of a search with a tilt, which was removed: simulate again", field="log_weight")
     kinds = {**_SCALARS, "start": int, "drivers": list, "failed": dict, "logged": int}
-    facts.setdefault("logged", 0)
+    facts = {"logged": 0, **facts}
     for name, kind in (kinds | {"prune_every": int} if "prune_every" in facts else kinds).items():
         if type(facts[name]) is not kind:
             raise DataError(f"is {facts[name]!r:.80}, which is of the wrong type", field=name)
