@@ -192,9 +192,9 @@ class Export(shared.Command):
         }
         write, suffix = writers[self.format]
         with files.Lock((out := self.out or self.folder / "export") / "export.lock"):
-            for name in self.segments or held.ids:
+            for name in dict.fromkeys(self.segments or held.ids):
                 saved = held.of(name)
-                for k in self.rollouts or range(saved.rollouts):
+                for k in dict.fromkeys(self.rollouts or range(saved.rollouts)):
                     if not 0 <= k < saved.rollouts:
                         raise errors.ConfigError(f"{name} has rollouts 0 to {saved.rollouts - 1}, not {k}")
                     made = write(saved, k)
