@@ -319,14 +319,14 @@ def test_json_says_who_is_the_ego_and_where_it_was_to_go():
 
 
 def test_the_command_writes_a_file_for_each_rollout(tmp_path, capsys):
-    saved = played(crossing(4, steps=11), [0, 1], 3)
+    saved = played(crossing(4, steps=11), [0, 1], 3, failed={1: "\udce9"})
     saved.collision[1, [4, 9], [1, 0]], saved.counted[1, 9, 0] = True, False
     save_all(tmp_path / "sim", About("made"), [saved, played(straight_road())])
     sim, out = str(tmp_path / "sim"), tmp_path / "json"
     assert main(["export", sim]) == 0
     names = [path.name for path in sorted((tmp_path / "sim" / "export").iterdir())]
     assert names == [*(f"crossing-0-{k}.xml" for k in range(3)), "straight-0-0.xml"]
-    arguments = ["--format", "json", "--out", str(out), "--segments", "crossing-0", "--rollouts", "1"]
+    arguments = ["--format", "json", "--out", str(out), "--segments", "crossing-0", "--rollouts", "1", "1"]
     assert main(["export", sim, *arguments]) == 0
     assert "written: 1 files" in capsys.readouterr().out
     (file,) = out.iterdir()
