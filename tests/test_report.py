@@ -130,16 +130,17 @@ def test_progress_is_along_the_route_and_relative_to_the_log(lines: list[Any]) -
 
 def red(states: Any = SignalState.STOP, others: Any = SignalState.GO, aside: float = 0) -> list[tuple[int, int]]:
     """Step and light of every red light that a car runs which comes from the south and goes straight on."""
-    segment = crossing(1, steps=31, seed=0)
-    path = np.stack([np.full(31, 1.75 + aside), -20 + np.arange(31) * 1.2], -1)
-    position = np.pad(path, ((0, 0), (0, 1)))[None].astype("f4")
-    light = np.full((12, 31), others, np.uint8)
+    position = np.stack([np.full(31, 1.75 + aside), -20 + np.arange(31) * 1.2, np.zeros(31)], -1)[None].astype("f4")
+    light, heading = np.full((12, 31), others, np.uint8), np.full((1, 31), np.pi / 2, np.float32)
     light[0] = states
-    heading = np.full((1, 31), np.pi / 2, np.float32)
-    segment = segment.replace(position=position, heading=heading, signal_state=light)
+    how = {"position": position, "heading": heading, "signal_state": light}
+    segment = crossing(1, steps=31, seed=0).replace(**how)
     saved = played(segment)
-    whole, rest = (red_lights(world_of(later(saved, k), 0), np.array([0]), Lanes(segment), k) for k in (0, 4))
-    assert (whole.step.tolist(), whole.light.tolist()) == ((rest.step + 4).tolist(), rest.light.tolist())
+    world, rest = world_of(saved, 0), world_of(later(saved, 4), 0)
+    short = world._replace(valid=world.valid & (np.arange(31) < 6))  # a single state behind the stop point
+    shown = (world, 0), (rest, 4), (short, 0)
+    whole, rest, short = (red_lights(one, np.array([0]), Lanes(segment), k) for one, k in shown)
+    np.testing.assert_array_equal([whole, whole], [rest._replace(step=rest.step + 4), short])
     return list(zip(whole.step.tolist(), whole.light.tolist(), strict=True))
 
 

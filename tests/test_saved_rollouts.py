@@ -178,11 +178,12 @@ def test_damage_is_found_and_named(tmp_path):
         with pytest.raises(DataError, match=message) as caught:
             load_rollouts(tmp_path / "sim")[k]
         assert (caught.value.file, caught.value.segment) == (files[k], f"straight-{k}")
-    # A shape that nothing could hold is damage too.
-    header = b'{"state": {"dtype": "F32", "shape": [0, 4611686018427387904, 8], "data_offsets": [0, 0]}}'
-    header += b" " * (-len(header) % 8)
-    with pytest.raises(DataError, match="file one, segment one: damaged"):
-        read_tensors(len(header).to_bytes(8, "little") + header, Path("one"), "one")
+    # A shape that nothing could hold is damage too, and a list in place of the facts.
+    shape = b'{"state": {"dtype": "F32", "shape": [0, 4611686018427387904, 8], "data_offsets": [0, 0]}}'
+    for header in (shape, b'{"__metadata__": {"symphony": "[]"}}'):
+        padded = header + b" " * (-len(header) % 8)
+        with pytest.raises(DataError, match="file one, segment one: damaged"):
+            read_tensors(len(padded).to_bytes(8, "little") + padded, Path("one"), "one")
     broken = played(straight_road())
     broken.state[0, 3] = np.nan
     with pytest.raises(DataError, match="not finite"):  # nor is it written
@@ -318,15 +319,16 @@ def test_json_says_who_is_the_ego_and_where_it_was_to_go():
 
 
 def test_the_command_writes_a_file_for_each_rollout(tmp_path, capsys):
-    saved = played(crossing(4, steps=11), [0, 1], 3)
+    saved = played(crossing(4, steps=11), [0, 1], 3, failed={1: "\udce9"})
     saved.collision[1, [4, 9], [1, 0]], saved.counted[1, 9, 0] = True, False
     save_all(tmp_path / "sim", About("made"), [saved, played(straight_road())])
     sim, out = str(tmp_path / "sim"), tmp_path / "json"
     assert main(["export", sim]) == 0
     names = [path.name for path in sorted((tmp_path / "sim" / "export").iterdir())]
     assert names == [*(f"crossing-0-{k}.xml" for k in range(3)), "straight-0-0.xml"]
-    arguments = ["--format", "json", "--out", str(out), "--segments", "crossing-0", "--rollouts", "1"]
+    arguments = ["--format", "json", "--out", str(out), "--segments", "crossing-0", "--rollouts", "1", "1"]
     assert main(["export", sim, *arguments]) == 0
+    assert "written: 1 files" in capsys.readouterr().out
     (file,) = out.iterdir()
     found, world = json.loads(file.read_text()), world_of(saved, 1)
     states = np.array(found["agents"][1]["states"])

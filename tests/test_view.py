@@ -30,7 +30,7 @@ from symphony.render.viewer.pack import packed_log
 from symphony.saved.folder import About, save_rollouts
 from symphony.saved.rollouts import SavedRollouts
 
-ABOUT = About("made </script><b>")
+ABOUT = About("made </script><b>\udce9")
 
 
 def blocks(page: str) -> list[str]:
@@ -56,7 +56,7 @@ def unpacked(text: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 def pages() -> list[SavedRollouts]:
     tracks = hide(crossing(5, steps=21), 3, slice(4, 9))
     turned = tracks.replace(heading=tracks.heading + np.float32(4 * np.pi))
-    saved = played(turned, [0, 2], 3, failed={2: "broke <b>off</b>"})
+    saved = played(turned, [0, 2], 3, failed={2: "broke <b>off</b>\udce9"})
     plan = np.random.default_rng(0).normal(0, 30, (3, 2, saved.steps, 4, 2)).astype("f4")
     plan[1, :, 3:, 2:], plan[2] = np.nan, np.nan
     saved = dataclasses.replace(saved, trees=random_trees(saved, branches=5), plan=plan)
@@ -262,9 +262,7 @@ def test_the_browser_reads_the_numbers_and_reacts(tmp_path: Path) -> None:
     told = {"2.0 s": "events", "into leader at fault": "events", "vehicle": "who", "rollout=1": "hash"}
     assert all(text in out[where] for text, where in told.items())
     assert out["between"] == pytest.approx(saved.state[0, 4:6, 0, 0].mean(), abs=1e-3)
-    assert out["zoomed"] == pytest.approx(2)
-    # Half a second at 5 Hz.
-    assert out["played"] == pytest.approx(4.5 + 2.5)
+    assert (out["zoomed"], out["played"]) == pytest.approx((2, 4.5 + 2.5))  # half a second at 5 Hz
     assert out["followed"][0] == pytest.approx(out["followed"][1])
     assert out["redrawn"] <= 6
     trees: Any = tree.trees
@@ -366,8 +364,7 @@ def test_planners_play_side_by_side_and_rollouts_are_chosen_by_events(tmp_path: 
     np.testing.assert_allclose(out["x"], [one.state[1, 12, 0, 0] for one in (hits, calm)], atol=1e-3)
     assert min(out["drawn"]) > 20
     assert out["wide"][0] == pytest.approx(out["wide"][1], abs=2)
-    assert out["metrics"]
-    assert (*out["clicked"][:2], out["back"], out["legend"]) == (1, 0, 7, "ASIDE")
+    assert (*out["clicked"][:2], out["back"], out["legend"], out["metrics"]) == (1, 0, 7, "ASIDE", True)
     assert "none in this rollout" in out["clicked"][2]
     np.testing.assert_allclose(out["plan"][0], plan[1, 0, 4, :2], atol=0.006)
     assert out["plan"][1:] == [[[7, 8]], [], [], []]

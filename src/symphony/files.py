@@ -69,9 +69,9 @@ def _lives(process: int) -> bool:
 
 
 def write_file(path: Path, text: str) -> None:
-    """Write a text file, as :func:`replacing` does."""
+    """Write a text file, as :func:`replacing` does; what UTF-8 can't hold, as of odd paths, is escaped."""
     with replacing(path) as draft:
-        draft.write_text(text, encoding="utf-8")
+        draft.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: Path, result: Any) -> None:

@@ -113,7 +113,7 @@ class View(shared.Command):
                 count = self.rollouts or (None if out.suffix[1:].lower() in FORMATS else 1)
                 for name in names if self.segments else names[:6]:
                     for folder in (folder for folder in folders if name in folder.ids):
-                        title = f"{shared.short_name(folder.about.agent)}: {name}"
+                        title = errors.printable(f"{shared.short_name(folder.about.agent)}: {name}")
                         clips.append(render.saved_clip(folder.of(name), count, title))
                 render.draw_clips(clips, out, columns=len(folders) if len(folders) > 1 else 3)
         shared.say(f"written: {out}")
@@ -192,9 +192,9 @@ class Export(shared.Command):
         }
         write, suffix = writers[self.format]
         with files.Lock((out := self.out or self.folder / "export") / "export.lock"):
-            for name in self.segments or held.ids:
+            for name in dict.fromkeys(self.segments or held.ids):
                 saved = held.of(name)
-                for k in self.rollouts or range(saved.rollouts):
+                for k in dict.fromkeys(self.rollouts or range(saved.rollouts)):
                     if not 0 <= k < saved.rollouts:
                         raise errors.ConfigError(f"{name} has rollouts 0 to {saved.rollouts - 1}, not {k}")
                     made = write(saved, k)

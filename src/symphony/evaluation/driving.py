@@ -135,7 +135,7 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
             at_end = along_lane[light] > 0.5 * length[light]
             part = slice(0, t + 1) if at_end else slice(t + 1, None)
             path = world.position[evaluated[m], part][world.valid[evaluated[m], part]]
-            # A step may be longer than the lane.
+            # A step may be longer than the lane; a way may have no length.
             way = shapely.linestrings(np.concatenate([path[:1], path]))
             points = shapely.line_interpolate_point(way, np.arange(way.length + 1))
             points = points[shapely.distance(points, shapely.points(stop[light])) <= length[light]]

@@ -19,7 +19,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from symphony.errors import ConfigError, DataError
+from symphony.errors import ConfigError, DataError, printable
 from symphony.render.style import AGENT_COLORS, INK, LANE, new_panels, picture_path, save
 
 Records = Sequence[Mapping[str, Any]]
@@ -33,9 +33,7 @@ PANELS: dict[str, tuple[str, ...]] = {
     "discriminator logit": ("discriminator_score_simulated", "discriminator_score_data"),
     "search: share in collision": ("search_collision_all", "search_collision_kept"),
     "search: share off the road": ("search_offroad_all", "search_offroad_kept"),
-    "validation: infractions, %": tuple(
-        f"validation_{name}" for name in ("collision_rate", "offroad_time", "infractions")
-    ),
+    "validation: infractions, %": ("validation_collision_rate", "validation_offroad_time", "validation_infractions"),
     "validation: displacement, m": ("validation_ade", "validation_min_sade"),
     "gradient norm": ("gradient_norm_policy", "gradient_norm_discriminator", "gradient_norm_goals"),
 }
@@ -91,7 +89,9 @@ def plot_curves(
             axes.legend(handles=lines, fontsize=6.5, framealpha=0.8, edgecolor="none", handlelength=2.2)
     for axes in slots[-columns:]:
         axes.set_xlabel("update", fontsize=8, color=INK)
-    handles = [Line2D([], [], color=color, linewidth=2.5, label=name) for name, color in colors.items()]
+    # What lies between two dollars would be set as a formula.
+    shown = {printable(name).replace("$", r"\$"): color for name, color in colors.items()}
+    handles = [Line2D([], [], color=color, linewidth=2.5, label=name) for name, color in shown.items()]
     place: dict[str, Any] = {"loc": "outside upper left", "ncols": min(len(handles), columns)}
     figure.legend(handles=handles, frameon=False, fontsize=9, **place)
     save(figure, file)

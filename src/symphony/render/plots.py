@@ -261,8 +261,7 @@ def draw_ways(
     past = slice(None if until is None else until + 1)
     ways = zip(clip.position[:, rank, past], clip.valid[:, rank, past], strict=True)
     lines = [step for way, valid in ways for step in pieces(way, valid)[0]]
-    colors = [to_rgba(color, clip.alpha)]
-    drawn = LineCollection(lines, colors=colors, linewidths=width, zorder=8, gid=gid)
+    drawn = LineCollection(lines, colors=[to_rgba(color, clip.alpha)], linewidths=width, zorder=8, gid=gid)
     axes.add_collection(drawn, autolim=False)
 
 
@@ -279,10 +278,10 @@ def draw_events(
 
 
 def draw_hit(axes: Axes, clip: Clip) -> Patch | None:
-    """Outline the playback agents that were hit, where they were when it began; return a legend entry if any."""
+    """Outline the playback agents that were hit, where states begin to overlap; return a legend entry if any."""
     segment, heights = clip.segment, agent_heights(clip.segment)
-    found: set[tuple[int, int]] = set()
-    for rollout, rank, at in np.argwhere(clip.beginnings("collision")).tolist():
+    over: set[tuple[int, int, int, int]] = set()
+    for rollout, rank, at in np.argwhere(clip.collision & clip.valid).tolist():
         step = clip.start + at
         near = clip.others[segment.valid[clip.others, step]]
         if len(heights):  # as in `symphony.geometry.frames.levels_apart`
@@ -293,7 +292,9 @@ def draw_hit(axes: Axes, clip: Clip) -> Patch | None:
         here = clip.position[[rollout], rank, at], clip.heading[[rollout], rank, at], size
         there = segment.position[near, step], segment.heading[near, step], segment.size[near]
         own, boxes = shapely.Polygon(place(CORNERS, *here)[0]), shapely.polygons(place(CORNERS, *there))
-        found |= {(int(agent), step) for agent in near[shapely.intersects(own, boxes)]}
+        over |= {(rollout, rank, agent, step) for agent in near[shapely.intersects(own, boxes)].tolist()}
+    # One may go on when the next begins.
+    found = {(agent, step) for *run, agent, step in over if (*run, agent, step - 1) not in over}
     if not found:
         return None
     agent, step = np.array(sorted(found)).T

@@ -223,4 +223,4 @@ def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
 
 def as_json(saved: SavedRollouts, rollout: int) -> str:
     """Return :func:`to_dict` as text."""
-    return json.dumps(to_dict(saved, rollout), ensure_ascii=False, allow_nan=False) + "\n"
+    return json.dumps(to_dict(saved, rollout), allow_nan=False) + "\n"

@@ -141,7 +141,7 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
         if self.has(name):
             raise DataError("the rollouts of this segment exist already", file=self.path, segment=name)
         arrays, facts = tensors_of(saved)
-        data = save(arrays, {KEY: json.dumps(facts, ensure_ascii=False)})
+        data = save(arrays, {KEY: json.dumps(facts)})
         file = f"{SEGMENTS}/{file_stem(name)}.safetensors"
         read_tensors(data, self.path / file, name)  # or it must not be written
         with replacing(self.path / file) as draft:
@@ -158,7 +158,7 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
         given = {name: value for name, value in vars(entry).items() if name not in absent}
         path = self.path / INDEX
         with naming(path), path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(given, ensure_ascii=False) + "\n")
+            file.write(json.dumps(given) + "\n")
             file.flush()
             os.fsync(file.fileno())
         self._entries[entry.segment] = entry
@@ -308,7 +308,7 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
     if "log_weight" in arrays:
         raise DataError("is of a search with a tilt, which was removed: simulate again", field="log_weight")
     kinds = {**_SCALARS, "start": int, "drivers": list, "failed": dict, "logged": int}
-    facts.setdefault("logged", 0)
+    facts = {"logged": 0, **facts}
     for name, kind in (kinds | {"prune_every": int} if "prune_every" in facts else kinds).items():
         if type(facts[name]) is not kind:
             raise DataError(f"is {facts[name]!r:.80}, which is of the wrong type", field=name)

@@ -92,8 +92,7 @@ def filled(page: str, parts: Mapping[str, str]) -> str:
         if not found:
             raise ValueError(f"the template has no {marker}")
         page = f"{before}\0{marker}\0{after}"
-    pieces = page.split("\0")
-    return "".join(parts.get(piece, piece) for piece in pieces)
+    return "".join(parts.get(piece, piece) for piece in page.split("\0"))
 
 
 _TYPES = {"i32": np.int32, "i16": np.int16, "u8": np.uint8, "f32": np.float32}
@@ -163,7 +162,7 @@ class _Packer:
 
     def text(self, facts: dict[str, Any]) -> str:
         told = {"facts": facts, "arrays": self.arrays}
-        header = json.dumps(told, ensure_ascii=False, allow_nan=False).encode()
+        header = json.dumps(told, allow_nan=False).encode()
         header += b" " * (-len(header) % 4)
         block = len(header).to_bytes(4, "little") + header + b"".join(self.data)
         return base64.b64encode(zlib.compress(block, 9)).decode()
