@@ -188,6 +188,7 @@ def test_where_there_is_no_place_nothing_is_kept(store: Path, monkeypatch) -> No
     assert not (builtin_store("test") / "experts").exists()
     monkeypatch.setattr(np, "save", lambda *_: Path("/").write_text("as bad as a full disk"))
     assert len(data(store).experts(0).agent)
+    monkeypatch.undo()
     (store / "experts").rmdir()
     (store / "experts").write_text("not a folder")
     assert len(data(store).experts(0).agent)

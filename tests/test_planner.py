@@ -528,13 +528,13 @@ def test_off_the_lanes_the_run_fails() -> None:
     assert not found.rollouts.counted.any()
 
 
-def test_the_log_is_reproduced_its_holes_are_filled_and_its_end_is_told() -> None:
-    whole = straight_road(3, steps=21)
+@pytest.mark.parametrize("whole", [straight_road(3, steps=21), crossing(4, seed=2, steps=21)])
+def test_the_log_is_reproduced_its_holes_are_filled_and_its_end_is_told(whole: RunSegment) -> None:
     found = driven(hide(hide(whole, 0, slice(8, 10)), 0, slice(16, 21)), planner="log")
     assert "step 15: ValueError: the log of the ego ends at step 15" in found.failed[0][0]
     assert found.rollouts.counted[0, 0].all(-1).tolist() == [True] * 15 + [False] * 5
     path = found.rollouts.state[0, 0, :16, 0].numpy()
     logged = np.column_stack([whole.position[0, :, :2], whole.heading[0], np.hypot(*whole.velocity[0].T)])[:16]
-    np.testing.assert_allclose(path[:, :2], logged[:, :2], atol=0.1)
+    np.testing.assert_allclose(path[:, :2], logged[:, :2], atol=0.2)
     known = [*range(8), *range(10, 16)]
     np.testing.assert_allclose(path[known], logged[known], atol=1e-4)

@@ -316,6 +316,7 @@ def test_playback_vehicles_are_drawn_where_they_were_hit() -> None:
     axes = plot_rollout(clip, blank())
     middles = corners(by_gid(axes, "hit")).mean(1)
     assert np.isclose(middles, segment.position[[1, 2], [at, at + 3], None, :2], atol=1e-3).all(-1).any(1).all()
+    assert len(middles) == 2  # one outline each, however long the contact
     assert "playback, when it was hit" in labels(axes)
     assert "hit" not in gids(plot_rollout(rollouts(segment, [0], 1), blank()))
 

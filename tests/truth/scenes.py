@@ -180,6 +180,7 @@ def rules() -> list[Case]:
     beside = (car(2, RIGHT),)
     waits = stops(ego(x=100), 2.0, 5.0)  # 2 s, then 10 m: the front is at 132.25
     return [
+        Case("runs a red light", "the front passes x = 150", ego(x=100), beside, {"red": 1}, light=red),
         Case("runs a red light at once", "the front passes x = 150", ego(x=146), beside, {"red": 1}, light=red),
         Case("leaves its lane past a red light", "at x = 150 the front is 1.6 m beside the middle",
             ego(x=100, y=RIGHT, aside=(4.2417, 5.2417, -3.0), turned=False), (), {"red": 1}, light=red),
