@@ -328,7 +328,7 @@ def test_the_command_writes_a_file_for_each_rollout(tmp_path, capsys):
     assert names == [*(f"crossing-0-{k}.xml" for k in range(3)), "straight-0-0.xml"]
     arguments = ["--format", "json", "--out", str(out), "--segments", "crossing-0", "--rollouts", "1", "1"]
     assert main(["export", sim, *arguments]) == 0
-    assert "written: 1 files" in capsys.readouterr().out
+    assert "written: 1 file in" in capsys.readouterr().out
     (file,) = out.iterdir()
     found, world = json.loads(file.read_text()), world_of(saved, 1)
     states = np.array(found["agents"][1]["states"])

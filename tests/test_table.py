@@ -365,7 +365,7 @@ def test_rows_must_be_comparable() -> None:
 
 
 WRONG = {"{": "not valid JSON", "[]": "not a JSON object", "{}": "format"}
-for wrong, why in (({"format": 99}, "format 99"), ({"run": None}, "field run")):
+for wrong, why in (({"format": 99}, "format 99"), ({"run": None}, "field run"), ({"segments": 0.5}, "field seg")):
     WRONG[json.dumps(make_record() | wrong)] = why
 
 

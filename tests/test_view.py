@@ -147,6 +147,7 @@ def test_chosen_segments_pictures_and_animations(tmp_path: Path, capsys: pytest.
         with Image.open(tmp_path / name) as image:
             assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 21)
     wrong = {("--out", str(tmp_path / "a.doc")): ".mp4", ("--segments", "nothing"): "no rollouts of this segment"}
+    wrong["--rollouts", "1"] = "a page plays all"
     for words, why in wrong.items():
         assert main(["view", sim, *words]) == 1
         assert why in capsys.readouterr().err

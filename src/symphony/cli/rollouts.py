@@ -102,8 +102,11 @@ class View(shared.Command):
             folders[0].of(lost[0])  # says that there is none
         folders = [folder.only(names) for folder in folders]
         out = self.folders[0] / "view.html" if self.out is None else self.out
+        page = out.suffix.lower() == ".html"
+        if page and self.rollouts:
+            raise errors.ConfigError("--rollouts is of pictures and films: a page plays all rollouts")
         with files.lock_file(out) if self.out is None else nullcontext():
-            if out.suffix.lower() == ".html":
+            if page:
                 from symphony.evaluation.report import report
 
                 write_view(folders, [report(folder, picked=True) for folder in folders], out)
@@ -201,4 +204,4 @@ class Export(shared.Command):
                     with files.replacing(out / f"{folder.file_stem(name)}-{k}.{suffix}") as draft:
                         draft.write_bytes(made if isinstance(made, bytes) else made.encode())
                     count += 1
-        shared.say(f"written: {count} files in {out}")
+        shared.say(f"written: {count} file{'s' * (count != 1)} in {out}")

@@ -153,6 +153,8 @@ def read_evaluation(file: Path) -> dict[str, Any]:
     record = read_json(file)
     if (found := record.get("format")) != FORMAT:
         raise DataError(f"format {found!r}, this version reads {FORMAT}", file=file, field="format")
+    if not isinstance(record.get("segments"), int):
+        raise DataError("is missing", file=file, field="segments")
     for part, names in _PARTS.items():
         if not isinstance(record.get(part), dict):
             raise DataError("is missing", file=file, field=part)
