@@ -207,7 +207,7 @@ MAP, META_DATA, SIGNALS, LANES = "../../maps/k1.osm", "meta_data.csv", "signal_p
     (META_DATA, None, "away from the map"),  # another projection
     (META_DATA, META.replace("001", "002"), "0 rows for recording 001"), (META_DATA, META[:-1], "cut short"),
     (SIGNALS, None, "are missing"), (SIGNALS, PHASES[:-1], "cut short"),
-    (SIGNALS, PHASES.replace("DARK", "PINK"), "is not a phase"),
+    (SIGNALS, PHASES.replace("DARK", "PINK"), "is not a phase"), (META_DATA, META.replace("Avail", ""), "yes nor no"),
     (SIGNALS, PHASES.replace("2000", "1000"), "has two states"),
     (SIGNALS, PHASES.replace("000,", ","), "the tracks at 11900 ms"), (LANES, None, "are missing"),
     (LANES, KML.replace("<kml", "<!DOCTYPE kml><kml", 1), "document type"),

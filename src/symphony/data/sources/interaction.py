@@ -322,7 +322,7 @@ def _read_meta(path: Path, part: str) -> tuple[Doubles, bool]:
         refuse(len(found) != 1, f"{len(found)} rows for recording {part}, expected one", "id")
         origin = np.array([base.number(found[0].get(name), name) for name in ("originLat", "originLon")])
         # Both spellings occur.
-        spat = found[0].get("spatAvailable") or found[0].get("spatAvailible") or "no"
+        spat = found[0].get("spatAvailable") or found[0].get("spatAvailible") or ""
         refuse(spat not in {"yes", "no"}, f"{spat[:20]!r} is neither yes nor no", "spatAvailable")
         return origin, spat == "yes"
 
