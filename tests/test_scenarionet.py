@@ -180,8 +180,8 @@ STATE, LINE, LIGHTS = "tracks/ego/state/", "map_features/on/polyline", "dynamic_
 @pytest.mark.parametrize(("path", "value", "field"), [
     ("id", 7, "id"), ("metadata", ..., "metadata"), ("metadata/ts", np.arange(STEPS) ** 2 * 0.1, "metadata: ts"),
     ("metadata/ts", np.full(STEPS, np.nan), "metadata: ts"), ("length", 7, "metadata"),
-    ("metadata/dataset", ..., "metadata: dataset"), ("metadata/current_time_index", "now", "metadata"),
-    ("tracks/ego/type", ..., "tracks ego"), ("map_features/on/type", ..., "map_features on"),
+    ("metadata/dataset", ..., "metadata: dataset"), ("map_features/on/type", ..., "map_features on"),
+    ("tracks/ego/type", ..., "tracks ego"), ("metadata/current_time_index", -1, "metadata: current_time_index"),
     ("metadata/sdc_id", "never", "metadata: sdc_id"), ("metadata/map", "\ud800", "group"),
     ("tracks", {}, "tracks"), ("metadata/ts", (np.arange(STEPS) / 10).astype(str), "metadata"),
     ("metadata/ts", np.zeros((STEPS, 2)), "metadata"), (STATE + "heading", np.zeros(2 * STEPS), "tracks ego"),

@@ -79,6 +79,7 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
         refuse(not 2 <= steps <= schema.MAX_STEPS, f"{steps} steps, expected 2 … {schema.MAX_STEPS}")
         refuse(not dataset, "names no dataset", "metadata: dataset")
         current = int(metadata.get("current_time_index") or 0)
+        refuse(not 0 <= current < steps, f"{current} outside the {steps} steps", "metadata: current_time_index")
         marked = [list(metadata.get(name) or ()) for name in ("objects_of_interest", "tracks_to_predict")]
         dt = base.time_step(times, "metadata: ts")
     names, kinds, states, valid = _tracks(scenario, steps)
