@@ -161,9 +161,11 @@ def test_commonroad_errors_are_named(text: str, field: str, message: str, tmp_pa
     ("<exact>1</exact>", "<intervalStart>1</intervalStart>", NO_OBSTACLE, "obstacle 7"),  # predicted
     ("<x>1.0</x>", "<x>NaN</x>", NO_OBSTACLE, "obstacle 7: position: nan is not finite"),
     ("<velocity><exact>10.0", "<velocity><exact>fast", NO_OBSTACLE, "obstacle 7: velocity: 'fast'"),
+    ("<type>car</type>", "", NO_OBSTACLE, "obstacle 7: type: missing"),
     (sources.RECTANGLE, "", NO_OBSTACLE, "obstacle 7: shape: expected one rectangle"),
     ('Obstacle id="7"', 'Obstacle id="99999999999999999999"', NO_OBSTACLE, "64 bits"),
     ("<x>25</x>", "<x>inf</x>", NO_LANELET, "lanelet 10: bound: inf is not finite"),
+    ("<leftBound>", "<leftBound/><leftBound>", NO_LANELET, "lanelet 10: bound: fewer than two points"),
     ('ref="11"', 'ref="next"', NO_LANELET, "lanelet 10: successor: 'next' is not an integer"),
     ("<color>red", "<color>pink", NO_LIGHT, "trafficLight 30: color: unknown colors ['pink']"),
     ("<duration>3</duration>", "", NO_LIGHT, "trafficLight 30: duration"),

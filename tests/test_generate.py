@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from helpers_segments import straight_road, turned
+from helpers_sources import off_road
 from helpers_store import fill
 from symphony.cli import main
 from symphony.data import generate as generation
@@ -484,14 +485,15 @@ def test_streets_of_openstreetmap_are_driven_and_footways_are_not(tmp_path: Path
 @needs_sumo
 @pytest.mark.parametrize("more", ["lefthand 1", "bikelanes.guess 1", "crossings.guess 1 --walkingareas 1"])
 def test_only_lanes_for_cars_count_on_either_side_of_the_road(tmp_path: Path, more: str) -> None:
-    grid = "--grid --grid.number 3 --grid.length 120 --default.lanenumber 2 --sidewalks.guess true"
-    run_program("netgenerate", f"{grid} --output-file g.net.xml --{more}", tmp_path)
+    grid = "--grid --grid.number 3 --grid.length 120 --default.lanenumber 2 --default-junction-type allway_stop"
+    run_program("netgenerate", f"{grid} --sidewalks.guess true --output-file g.net.xml --{more}", tmp_path)
     file = tmp_path / "g.net.xml"
     text = file.read_text().replace('disallow="pedestrian', 'disallow="truck bus pedestrian')
     file.write_text(text.replace('from="A0A1" to="A1', 'disallow="passenger" from="A0A1" to="A1', 1))  # a turn
     assert generate(Plan(1, kinds=(str(file),)), tmp_path / "store").complete
     (segment,) = SegmentStore(tmp_path / "store")
     assert segment.road.lane_width == pytest.approx(3.2)
+    assert off_road(segment.road, segment.road.marks.points[:, :2]).min() > -0.01  # stop signs
     check_segments([segment])
 
 

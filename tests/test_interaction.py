@@ -154,15 +154,15 @@ def test_headings_that_are_not_those_of_the_motion(tmp_path: Path) -> None:
     path = public(tmp_path, turned(raw(), 3.1))
     assert read_error("interaction", path).field == "psi_rad"
     np.testing.assert_allclose(read_one("interaction", path, motion="positions").heading, 0, atol=1e-3)
-    # What stands before it moves is turned as well, and small differences are none.
+    # What stands before it moves is turned as well, small differences are none, and one that stands keeps what was
+    # logged. A window that shows the first seconds alone has the same states.
     still, later = track(0, speed=0, steps=range(30)), track(0, x=-30, steps=range(30, 120))
-    rows = turned(still, 2.5) + turned(later, 0.3)
-    both = read_one("interaction", public(tmp_path, rows), motion="positions").heading[0]
-    np.testing.assert_allclose(both, np.where(np.arange(101) < 30, 0, 0.3), atol=1e-3)
-    # One that stands keeps the heading that was logged.
-    rows = [*raw(), *turned(track(9, x=20, speed=0), 1.25)]
-    found = read_one("interaction", public(tmp_path, rows), motion="positions")
-    np.testing.assert_allclose(found.heading[3], 1.25, rtol=1e-6)
+    rows = [*turned(still, 2.5), *turned(later, 0.3), *track(5, y=6), *turned(track(9, x=20, speed=0), 1.25)]
+    (whole,), (first, *_) = (segments(public(tmp_path, rows), motion="positions", window=w) for w in (10, 3))
+    np.testing.assert_allclose(whole.heading[0], np.where(np.arange(101) < 30, 0, 0.3), atol=1e-3)
+    np.testing.assert_allclose(whole.heading[2], 1.25, rtol=1e-6)
+    np.testing.assert_array_equal(whole.velocity[:, :31], first.velocity)
+    np.testing.assert_array_equal(whole.heading[:, :31], first.heading)
 
 
 def test_states_logged_twice(tmp_path: Path) -> None:
@@ -207,7 +207,7 @@ MAP, META_DATA, SIGNALS, LANES = "../../maps/k1.osm", "meta_data.csv", "signal_p
     (META_DATA, None, "away from the map"),  # another projection
     (META_DATA, META.replace("001", "002"), "0 rows for recording 001"), (META_DATA, META[:-1], "cut short"),
     (SIGNALS, None, "are missing"), (SIGNALS, PHASES[:-1], "cut short"),
-    (SIGNALS, PHASES.replace("DARK", "PINK"), "is not a phase"),
+    (SIGNALS, PHASES.replace("DARK", "PINK"), "is not a phase"), (META_DATA, META.replace("Avail", ""), "yes nor no"),
     (SIGNALS, PHASES.replace("2000", "1000"), "has two states"),
     (SIGNALS, PHASES.replace("000,", ","), "the tracks at 11900 ms"), (LANES, None, "are missing"),
     (LANES, KML.replace("<kml", "<!DOCTYPE kml><kml", 1), "document type"),

@@ -74,9 +74,7 @@ def test_successors_begin_where_a_lane_ends(tmp_path: Path) -> None:
         (((40, 0), (60, 0)), True), (((40.3, 0.3), (60, 0)), True), (((40.6, 0), (60, 0)), False),
         (((40, 0), (50, 10)), True), (((40, 0), (45, 10)), False), (((40, 0), (20, 0.5)), False),
     ):  # fmt: skip
-        tree = scenario()
-        tree["map_features"]["on"]["polyline"] = line(*points)
-        found = read_one("scenarionet", write(tmp_path, tree)).road.successors.tolist()
+        found = read_one("scenarionet", write(tmp_path, changed(LINE, line(*points)))).road.successors.tolist()
         assert ([0, 2] in found) == succeeds, points
 
 
@@ -84,12 +82,13 @@ def test_what_other_sources_say_about_the_map(tmp_path: Path) -> None:
     """Links, limits, edges and lights as ScenarioNet has them of the Waymo dataset and of nuPlan."""
     tree = changed("metadata/dataset", "waymo")
     features = tree["map_features"]
-    for name in ("boundary_0", "boundary_1"):
-        del features[name]
+    del features["boundary_0"], features["boundary_1"]
     features["right"] |= {"exit_lanes": ["left", "gone"], "left_neighbor": [{"feature_id": "left"}]}
     features["edge"] = {"type": "ROAD_EDGE_BOUNDARY", "polyline": ring((0, -2), (80, -2))}
     features["zebra"] = {"type": "CROSSWALK", "polygon": ring((38, -2), (40, -2), (40, 6))}
     features["sign"] = {"type": "STOP_SIGN", "position": FAR + np.array([39, -3])}
+    marked = {"objects_of_interest": ["p1", "gone"], "tracks_to_predict": {"never": {}, "8f3a": {}, "p1": {}}}
+    tree["metadata"] |= {**marked, "current_time_index": 10}
     features["later"] = {"type": "SOMETHING_NEW", "polyline": line((0, 0), (1, 1))}
     states = 10 * ["LANE_STATE_STOP"] + 5 * ["TRAFFIC_LIGHT_GREEN"] + (STEPS - 15) * [None]
     tree["dynamic_map_states"] = {
@@ -98,6 +97,7 @@ def test_what_other_sources_say_about_the_map(tmp_path: Path) -> None:
         "gone": {"lane": "gone", "state": {"object_state": states}},
     }
     segment = read_one("scenarionet", write(tmp_path, tree))
+    assert (segment.interest.tolist(), segment.predict.tolist(), segment.current_step) == ([3], [0, 3], 10)
     road = segment.road
     links = [each.tolist() for each in (road.successors, road.left_neighbors, road.right_neighbors)]
     assert links == [[[0, 1]], [[0, 1]], []]
@@ -130,8 +130,7 @@ def test_a_track_of_nuscenes_does_not_stop_where_it_ends(tmp_path: Path) -> None
 
 def test_long_outlines_that_were_cut_up_leave_no_islands_as_road(tmp_path: Path) -> None:
     """As ScenarioNet writes Argoverse 2: pieces of 20 points, so that only short rings are whole."""
-    tree = scenario()
-    tree["metadata"]["dataset"] = "av2"
+    tree = changed("metadata/dataset", "av2")
     features = tree["map_features"]
     for lane in ("right", "left", "on", "end"):
         features[lane].pop("polygon", None)
@@ -181,12 +180,14 @@ STATE, LINE, LIGHTS = "tracks/ego/state/", "map_features/on/polyline", "dynamic_
 @pytest.mark.parametrize(("path", "value", "field"), [
     ("id", 7, "id"), ("metadata", ..., "metadata"), ("metadata/ts", np.arange(STEPS) ** 2 * 0.1, "metadata: ts"),
     ("metadata/ts", np.full(STEPS, np.nan), "metadata: ts"), ("length", 7, "metadata"),
+    ("metadata/dataset", ..., "metadata: dataset"), ("map_features/on/type", ..., "map_features on"),
+    ("tracks/ego/type", ..., "tracks ego"), ("metadata/current_time_index", -1, "metadata: current_time_index"),
     ("metadata/sdc_id", "never", "metadata: sdc_id"), ("metadata/map", "\ud800", "group"),
     ("tracks", {}, "tracks"), ("metadata/ts", (np.arange(STEPS) / 10).astype(str), "metadata"),
     ("metadata/ts", np.zeros((STEPS, 2)), "metadata"), (STATE + "heading", np.zeros(2 * STEPS), "tracks ego"),
     (STATE + "heading", np.zeros((STEPS, 2)), "tracks ego"), (STATE + "position", np.zeros((STEPS, 2)), "tracks ego"),
     (STATE + "position", np.zeros((3, STEPS)), "tracks ego"),
-    (STATE + "heading", np.array(STEPS * ["a"]), "tracks ego"),
+    (STATE + "heading", np.array(STEPS * ["a"]), "tracks ego"), ("map_features/on/exit_lanes", 7, "map_features on"),
     (STATE + "heading", np.full(STEPS, np.inf), "heading"), (LINE, [[[1], [2]]], "map_features on"),
     (LINE, [(1, 2), (1, 2, 3)], "map_features on"), (LINE, np.full((2, 2), "7"), "map_features on"),
     (LINE, [(1e9, 0)], "map_features on"), (LINE, [(10**400, 0)], "map_features on"),
@@ -204,7 +205,7 @@ def test_what_holds_itself_many_times_is_no_word(tmp_path: Path) -> None:
     value: Any = []
     for _ in range(60):
         value = [value, value]
-    tree = changed("metadata/dataset", value)
+    tree = changed("metadata/map", value)
     tree["tracks"]["ego"]["type"] = tree["map_features"]["on"]["type"] = value
     found = read_one("scenarionet", write(tmp_path, tree))
     assert found.agent_type[found.ego] == AgentType.OTHER

@@ -212,9 +212,8 @@ def convert(
     out = Path(out).resolve()
     reader, options = _reader(reader, reader_options)
     settings = {"reader": reader.name, "rate": rate, "interactive": interactive, "smooth": smooth} | options
-    flags = {"exclude_overlaps": exclude_overlaps, "hold_lights": hold_lights, "strict": strict}
-    settings |= {name: value for name, value in flags.items() if value}
-    settings |= {} if radius is None else {"radius": radius}
+    given = {"exclude_overlaps": exclude_overlaps, "hold_lights": hold_lights, "strict": strict, "radius": radius}
+    settings |= {name: value for name, value in given.items() if value}
     paths = expand(files, reader.patterns)
     read = [file for path in paths for file in (path, *reader.companions(path)) if file.exists()]
     job = Job(

@@ -49,8 +49,7 @@ MAX_CYCLE = 10**8  # steps in one cycle of a traffic light: more would not fit t
 Box = tuple[Sequence[float], Doubles, float]
 """(length, width) of the box around an obstacle's shape, its centre in the obstacle's frame [2], its turn."""
 _CARS = ("car", "truck", "bus", "priorityVehicle", "parkedVehicle", "train", "motorcycle", "taxi")
-_PEOPLE = {"pedestrian": AgentType.PEDESTRIAN, "bicycle": AgentType.CYCLIST}
-_TYPES = dict.fromkeys(_CARS, AgentType.VEHICLE) | _PEOPLE
+_TYPES = dict.fromkeys(_CARS, AgentType.VEHICLE) | {"pedestrian": AgentType.PEDESTRIAN, "bicycle": AgentType.CYCLIST}
 _SCENERY = frozenset({"roadBoundary", "building", "pillar", "median_strip"})
 _LANE_TYPES = (
     (LaneType.BIKE_LANE, {"bicycleLane"}),
@@ -170,8 +169,7 @@ def _tracks(
     nodes += [(node, _text(node, "role") == "dynamic") for node in root.findall("obstacle")]
     nodes = [(node, moves) for node, moves in nodes if moves or _text(node, "type") not in _SCENERY]
     nodes.sort(key=lambda entry: not entry[1])
-    read = [(readable(NO_OBSTACLE, odd, _obstacle, node, moves), moves) for node, moves in nodes]
-    found = [(*each, moves) for some, moves in read for each in some]
+    found = [(*each, moves) for node, moves in nodes for each in readable(NO_OBSTACLE, odd, _obstacle, node, moves)]
     if problem is not None:
         found.insert(0, (*_problem(problem), True))
     logs = [log for _, _, log, _, moves in found if moves]
@@ -234,7 +232,8 @@ def _obstacle(node: ET.Element, moves: bool) -> tuple[int, int, Doubles, Box]:
     role = _text(node, "role") if node.tag == "obstacle" else "dynamic"
     refuse(role not in {"dynamic", "static"}, f"unknown role {role!r}", f"{name}: role")
     states = [*node.findall("initialState"), *(node.findall("trajectory/state") if moves else [])]
-    refuse(node.find("initialState") is None, "missing", f"{name}: initialState")
+    for tag in ("type", "initialState"):
+        refuse(node.find(tag) is None, "missing", f"{name}: {tag}")
     log = np.array([_state(state, name, moves) for state in states], np.float64)
     if moves:
         predicted = node.find("occupancySet") is not None
@@ -352,14 +351,12 @@ def _speed_limits(sign: ET.Element) -> dict[int, float]:
     return limits
 
 
-def _lanelet(node: ET.Element, limits: dict[int, float]) -> _Lanelet | None:
-    """Return a lanelet; None where one of its bounds has fewer than two points."""
+def _lanelet(node: ET.Element, limits: dict[int, float]) -> _Lanelet:
     lanelet_id = base.integer(node.get("id"), "lanelet id")
     field = f"lanelet {lanelet_id}"
     bounds = [node.find(f"{side}Bound") for side in ("left", "right")]
     left, right = (_points(bound, f"{field}: bound") for bound in bounds)
-    if min(len(left), len(right)) < 2:
-        return None
+    refuse(min(len(left), len(right)) < 2, "fewer than two points", f"{field}: bound")
     if len(left) != len(right):
         count = max(len(left), len(right))
         left, right = lines.evenly(left, count), lines.evenly(right, count)

@@ -130,6 +130,7 @@ class InteractionReader(Reader):
             first = int(mine.time[0])
             steps = int(mine.time[-1]) - first + 1
             refuse(steps > MAX_STEPS, f"{steps} steps, at most {MAX_STEPS} can be read", "timestamp_ms")
+            mine = tracks.completed(mine, dt, by_positions=self.by_positions)
             for at, end in self._windows(steps, dt) if files.single else [(0, steps)]:
                 window = first + at, first + end
                 what = f"t{round(at * dt, 3):g}" if files.single else f"case{case}"
@@ -159,10 +160,8 @@ class InteractionReader(Reader):
         step = rows.time - begin
         state[row, step], valid[row, step] = rows.state[:, :5], True
         state[valid, :2] -= scene.origin
-        if self.by_positions:
-            state = tracks.from_positions(state, valid, scene.dt)
         there = np.flatnonzero(~_lost(valid, scene.dt))
-        state, valid = tracks.headings(state, valid)[:, there], valid[:, there]
+        state, valid = state[:, there], valid[:, there]
         kinds = kind.astype(np.uint8)
         candidates = base.busiest_first(ids, kinds, state[..., :2], valid)
         refuse(not len(candidates), "no moving vehicle is observed at every step", "track_id")
@@ -322,7 +321,7 @@ def _read_meta(path: Path, part: str) -> tuple[Doubles, bool]:
         refuse(len(found) != 1, f"{len(found)} rows for recording {part}, expected one", "id")
         origin = np.array([base.number(found[0].get(name), name) for name in ("originLat", "originLon")])
         # Both spellings occur.
-        spat = found[0].get("spatAvailable") or found[0].get("spatAvailible") or "no"
+        spat = found[0].get("spatAvailable") or found[0].get("spatAvailible") or ""
         refuse(spat not in {"yes", "no"}, f"{spat[:20]!r} is neither yes nor no", "spatAvailable")
         return origin, spat == "yes"
 

@@ -255,40 +255,34 @@ def _speeds(rows: Rows, dt: float) -> Doubles:
     return found
 
 
-def from_positions(state: Doubles, valid: Bools, dt: float) -> Doubles:
-    """Return states [A, T, 5] (x, y, velocity, heading) with velocities that are slopes of the positions.
+def completed(rows: Rows, dt: float, *, by_positions: bool) -> Rows:
+    """Return rows of one case, headings that are not given being the direction of motion at the nearest step at which
+    the agent moves, or 0 if it never does.
 
-    Headings that are far off the motion become NaN, which :func:`headings` fills. They are compared with the motion
-    at the nearest step at which the agent moves: trackers give 0 to what stands before it moves. An agent that never
-    moves keeps what was logged; driving backwards can't be recognised.
+    If ``by_positions``, velocities become slopes of the positions, and headings that are far off the motion do not
+    count: trackers give 0 to what stands before it moves. Driving backwards can't be recognised. Whole tracks are
+    looked at, so that a state is the same in every window.
     """
-    # The line reaches over 4 sigma: at least to the next step.
-    _, slope, _ = local_line(state[..., :2], valid, dt, max(SIGMA, dt / 4))
-    found = state.copy()
-    found[..., 2:4] = slope
-    course = _nearest_course(found, valid)
-    found[np.abs(wrap(found[..., 4] - course)) > OFF, 4] = np.nan
-    return found
+    order, state = np.lexsort((rows.time, rows.track)), rows.state.copy()
+    for mine in np.split(order, np.flatnonzero(np.diff(rows.track[order])) + 1):
+        if not by_positions and not np.isnan(state[mine, 4]).any():
+            continue
+        step = rows.time[mine] - rows.time[mine[0]]
+        if by_positions:
+            place, valid = np.zeros((1, step[-1] + 1, 2)), np.zeros((1, step[-1] + 1), np.bool_)
+            place[0, step], valid[0, step] = state[mine, :2], True
+            # The line reaches over 4 sigma: at least to the next step.
+            state[mine, 2:4] = local_line(place, valid, dt, max(SIGMA, dt / 4))[1][0, step]
+        course = _nearest_course(state[mine, 2:4], step)
+        off = by_positions & (np.abs(wrap(state[mine, 4] - course)) > OFF)
+        state[mine, 4] = np.where(off | np.isnan(state[mine, 4]), np.nan_to_num(course), state[mine, 4])
+    return replace(rows, state=state)
 
 
-def headings(state: Doubles, valid: Bools) -> Doubles:
-    """Return states [A, T, 5] in which headings that are NaN are the direction of motion at the nearest step.
-
-    One that never moves and has no heading gets 0. Masked states become 0.
-    """
-    found = np.where(valid[..., None], state, 0.0)
-    unknown = np.isnan(found[..., 4])
-    found[unknown, 4] = np.nan_to_num(_nearest_course(found, valid)[unknown])
-    return found
-
-
-def _nearest_course(state: Doubles, valid: Bools) -> Doubles:
-    """Return [A, T] direction of motion at the nearest step at which the agent moves; NaN if it never does."""
-    course = np.arctan2(state[..., 3], state[..., 2])
-    moves = valid & (np.hypot(state[..., 2], state[..., 3]) > WALKING)
-    steps = np.arange(valid.shape[1])
-    found = np.full(valid.shape, np.nan)
-    for agent in np.flatnonzero(moves.any(axis=1)):
-        known = np.flatnonzero(moves[agent])
-        found[agent] = course[agent, known[np.abs(steps[:, None] - known).argmin(axis=1)]]
-    return found
+def _nearest_course(velocity: Doubles, step: NDArray[np.int64]) -> Doubles:
+    """Return [N] direction of motion at the nearest step at which an agent moves; NaN if it never does."""
+    known = np.flatnonzero(np.hypot(*velocity.T) > WALKING)
+    if not len(known):
+        return np.full(len(step), np.nan)
+    middle = (step[known[1:]] + step[known[:-1]]) / 2
+    return np.asarray(np.arctan2(*velocity[known[np.searchsorted(middle, step)]].T[::-1]))

@@ -42,8 +42,7 @@ MPH, KMH = 0.44704, 1 / 3.6
 _DRIVABLE = ["road", "highway", "play_street", "bus_lane", "emergency_lane", "exit", "parking", "freespace"]
 """Subtypes of areas on which vehicles may be."""
 _NO_LANES = frozenset({"walkway", "shared_walkway", "crosswalk", "stairs", "rail"})
-_BIKES = ("bicycle_lane", "bikelane")
-_TYPES = dict.fromkeys(_BIKES, LaneType.BIKE_LANE) | {"highway": LaneType.FREEWAY}
+_TYPES = dict.fromkeys(("bicycle_lane", "bikelane"), LaneType.BIKE_LANE) | {"highway": LaneType.FREEWAY}
 _EDGES = frozenset({"road_border", "curbstone", "fence", "wall", "guard_rail", "jersey_barrier"})
 _PAINT = frozenset({"line_thin", "line_thick", "stop_line"})
 _STOP_SIGNS = re.compile(r"(de206|r1-1(?!\d)|\bstop\b)", re.IGNORECASE)

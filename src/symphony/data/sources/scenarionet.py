@@ -48,9 +48,8 @@ _COLORS = {"GREEN": SignalState.GO, "YELLOW": SignalState.CAUTION, "RED": Signal
 _LIGHTS = {f"LANE_STATE_{state.name}": state for state in SignalState}
 _LIGHTS |= {f"TRAFFIC_LIGHT_{color}": state for color, state in _COLORS.items()}
 _LIGHTS |= dict.fromkeys(("TRAFFIC_LIGHT_UNKNOWN", "None"), SignalState.UNKNOWN)
-_STREETS = ("LANE_SURFACE_STREET", "LANE_SURFACE_UNSTRUCTURE")
-_LANES = {"LANE_UNKNOWN": LaneType.UNDEFINED, "LANE_FREEWAY": LaneType.FREEWAY}
-_LANES |= {"LANE_BIKE_LANE": LaneType.BIKE_LANE, **dict.fromkeys(_STREETS, LaneType.SURFACE_STREET)}
+_LANES = {f"LANE_{kind.name}": kind for kind in LaneType}
+_LANES |= {"LANE_UNKNOWN": LaneType.UNDEFINED, "LANE_SURFACE_UNSTRUCTURE": LaneType.SURFACE_STREET}
 _AREAS = {kind.name: kind for kind in (MarkType.CROSSWALK, MarkType.SPEED_BUMP, MarkType.DRIVEWAY)}
 _NO_LIMITS = frozenset({"nuscenes", "av2"})
 """Datasets without speed limits: ScenarioNet writes 100 km/h for connectors, and 85 mph for all lanes."""
@@ -78,18 +77,22 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
         steps, ego, dataset = len(times), metadata["sdc_id"], _text(metadata.get("dataset"))
         place, date = metadata.get("map"), metadata.get("date", metadata.get("log_name"))
         refuse(not 2 <= steps <= schema.MAX_STEPS, f"{steps} steps, expected 2 … {schema.MAX_STEPS}")
+        refuse(not dataset, "names no dataset", "metadata: dataset")
+        current = int(metadata.get("current_time_index") or 0)
+        refuse(not 0 <= current < steps, f"{current} outside the {steps} steps", "metadata: current_time_index")
+        marked = [list(metadata.get(name) or ()) for name in ("objects_of_interest", "tracks_to_predict")]
         dt = base.time_step(times, "metadata: ts")
     names, kinds, states, valid = _tracks(scenario, steps)
     refuse(ego not in names, "names no track that is valid at some step", "metadata: sdc_id")
     row = names.index(ego)
-    origin = np.round(states[row, np.argmax(valid[row]), :3])
-    origin[2] = 0
+    origin = np.append(np.round(states[row, np.argmax(valid[row]), :2]), 0.0)
     road, lanes = _map(scenario, dataset, origin)
     found = _signals(scenario.get("dynamic_map_states") or {}, lanes, steps, dataset)
     if dataset == "nuscenes":
         # The last of consecutive valid states gets the velocity of the one before.
         last = valid[:, 1:] & valid[:, :-1] & ~np.pad(valid[:, 2:], ((0, 0), (0, 1)))
         states[:, 1:, 4:6][last] = states[:, :-1, 4:6][last]
+    interest, predict = (np.array([names.index(k) for k in each if k in names], np.int32) for each in marked)
     numeric = all(each.isdecimal() and len(each) < 18 for each in names)
     segment = RunSegment(
         segment_id=name.replace("/", "_"),
@@ -103,6 +106,9 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
         road=road,
         **lines.lights(found, steps, origin),
         origin=origin,
+        current_step=current,
+        interest=interest,
+        predict=predict,
         file=file,
         group=f"{dataset} {place} {date}" if isinstance(place, str) and isinstance(date, str) else "",
     )
@@ -124,7 +130,7 @@ def _tracks(scenario: Mapping[Any, Any], steps: int) -> tuple[list[str], list[in
             valid = parts[0][:, 0] > 0
             states = np.where(valid[:, None], np.concatenate(parts[1:], axis=1), 0.0)
             if valid.any():
-                found.append((str(key), _TYPES.get(_text(track.get("type")), AgentType.OTHER), states, valid))
+                found.append((str(key), _TYPES.get(_text(track["type"]), AgentType.OTHER), states, valid))
     refuse(not found, "has no agents", "tracks")
     names, kinds, all_states, masks = zip(*found, strict=True)
     return list(names), list(kinds), np.stack(all_states), np.stack(masks)
@@ -188,7 +194,7 @@ def _map(scenario: Mapping[Any, Any], dataset: str, origin: Doubles) -> tuple[Ro
         features = scenario["map_features"].items()
     for key, node in features:
         with located(field=f"map_features {str(key)[:60]}"):
-            kind = _text(node.get("type"))
+            kind = _text(node["type"])
             line, area = (_points(node.get(name, ())) for name in ("polyline", "polygon"))
             if dataset == "nuscenes":
                 line = line[:, :2]  # the third number is a heading
@@ -226,14 +232,14 @@ def _lane(name: str, node: Mapping[Any, Any], line: Doubles, area: Doubles | Non
     known = isinstance(limit, int | float) and 0 < limit < 300 and dataset not in _NO_LIMITS
     # Of these, ScenarioNet names all lanes of a road, of nuPlan in an order that need not be theirs.
     told = {} if dataset in {"nuplan", "metadrive"} else node
-    left, right = (_references(told.get(f"{side}_neighbor")) for side in ("left", "right"))
+    left, right = (_references(told.get(f"{side}_neighbor") or ()) for side in ("left", "right"))
     return Lane(
         name=name,
         line=line,
         kind=_LANES[str(node["type"])],
         width=_width(line, area),
         speed_limit=float(limit) / 3.6 if known and limit is not None else np.nan,
-        successors=_references(node.get("exit_lanes")),
+        successors=_references(node.get("exit_lanes") or ()),
         left=left,
         right=right,
     )
@@ -242,8 +248,7 @@ def _lane(name: str, node: Mapping[Any, Any], line: Doubles, area: Doubles | Non
 def _references(values: Any) -> tuple[str, ...]:
     if isinstance(values, Array):
         values = values.value.ravel().tolist()
-    if not isinstance(values, list | tuple):
-        return ()
+    refuse(not isinstance(values, list | tuple), "links that are no list")
     return tuple(str(v.get("feature_id")) if isinstance(v, dict) else str(v) for v in values)
 
 

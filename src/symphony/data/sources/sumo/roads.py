@@ -41,7 +41,7 @@ class Network:
     edge_names: list[str]
     successors: NDArray[np.int64]  # [E, 2] lanes (from, to)
     connectors: dict[str, list[tuple[int, int, int]]]  # per light (link, connector it controls, lane before)
-    stop_lanes: list[int]  # the rightmost lane of each edge that ends at a stop sign
+    stop_lanes: dict[int, int]  # the lane at the kerb of each edge that ends at a stop sign -> 1, or -1: kerb left
     junction_shapes: list[Doubles]  # the paved area of each junction
     centers: Doubles  # [J, 2] junctions where at least three streets meet or lanes split or join, or middles of roads
 
@@ -96,6 +96,7 @@ def for_cars(lane: ET.Element) -> bool:
 def read_network(file: Path) -> Network:
     """Read a compiled network (``.net.xml``): its lanes for cars."""
     root = ET.parse(file).getroot()  # noqa: S314
+    side = -1 if root.get("lefthand") == "true" else 1
     lanes: list[Doubles] = []
     width, speed, internal, edge, names = [], [], [], [], []
     index: dict[str, int] = {}
@@ -108,7 +109,7 @@ def read_network(file: Path) -> Network:
             continue
         names.append(element.attrib["id"])
         # From right to left, which is the other way round where people drive on the left.
-        for lane in list(filter(for_cars, element.iter("lane")))[:: -1 if root.get("lefthand") == "true" else 1]:
+        for lane in list(filter(for_cars, element.iter("lane")))[::side]:
             index[lane.attrib["id"]] = len(lanes)
             lanes.append(shape(lane.attrib["shape"]))
             width.append(float(lane.get("width", _DEFAULT_WIDTH)))
@@ -126,7 +127,7 @@ def read_network(file: Path) -> Network:
         if "tl" in link.attrib:
             connectors.setdefault(link.attrib["tl"], []).append((int(link.attrib["linkIndex"]), via, start))
         if link.get("state") in {"s", "w"}:
-            stops.add(edge.index(edge[start]))
+            stops.add([k for k, own in enumerate(edge) if own == edge[start]][::side][0])
     shapes, centers = [], []
     for junction in root.iter("junction"):
         outline = shape(junction.get("shape", ""))
@@ -149,7 +150,7 @@ def read_network(file: Path) -> Network:
         names,
         np.array(sorted(successors), dtype=np.int64).reshape(-1, 2),
         connectors,
-        sorted(stops),
+        dict.fromkeys(sorted(stops), side),
         shapes,
         np.array(centers).reshape(-1, 2),
     )
@@ -198,7 +199,7 @@ def crop_network(network: Network, center: Doubles, radius: float) -> Crop:
     right = np.flatnonzero(same & ~network.internal[kept[:-1]])
     left = np.stack([right, right + 1], -1).astype(np.int32)
     ends = {k: lines[i][-1] for i, k in enumerate(kept) if whole_end[i]}
-    marks = [_beside(lines[place[k]], network.width[k]) for k in network.stop_lanes if k in ends]
+    marks = [_beside(lines[place[k]], network.width[k], side) for k, side in network.stop_lanes.items() if k in ends]
     kinds = np.where(network.speed[kept] > _FREEWAY_SPEED, LaneType.FREEWAY, LaneType.SURFACE_STREET)
     road = RoadMap(
         lanes=Polylines.of(lines),
@@ -240,10 +241,10 @@ def densify(line: Doubles, spacing: float) -> Doubles:
     return np.stack([np.interp(s, at, line[:, 0]), np.interp(s, at, line[:, 1])], -1)
 
 
-def _beside(line: Doubles, width: float) -> Doubles:
-    """Return [1, 2] where a sign stands: right of the end of a lane."""
+def _beside(line: Doubles, width: float, side: int) -> Doubles:
+    """Return [1, 2] where a sign stands: right of the end of a lane, or left for a side of -1."""
     along = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
-    return (line[-1] + np.array([along[1], -along[0]]) * (width / 2 + 0.5))[None]
+    return (line[-1] + side * np.array([along[1], -along[0]]) * (width / 2 + 0.5))[None]
 
 
 def _drivable(network: Network, center: Doubles, radius: float) -> Polygon | MultiPolygon:
