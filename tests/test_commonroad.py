@@ -23,6 +23,7 @@ from symphony.data.sources.lines import SLIT, drivable_rings
 from symphony.envs import scene
 from symphony.evaluation.planners import run_score
 from symphony.evaluation.report import report
+from symphony.planners.interface import scenario_of
 from symphony.roadgraph import LaneGraph
 from symphony.rollouts.crowd import crowd_dataset
 from symphony.saved.saving import save_simulation
@@ -295,6 +296,7 @@ def test_the_ego_of_a_planning_problem_is_on_its_way_to_the_goal(path, tmp_path,
     np.testing.assert_allclose(segment.goal + segment.origin[:2], place, atol=0.2)
     store = fill(tmp_path / "store", [segment])
     assert (store[0].goal, store.tags(0)) == (segment.goal, {})
+    assert scenario_of(store[0], 0, np.zeros((0, 2)), np.zeros(4), 0).goal.tolist() == segment.goal
     assert content_hash(store[0]) == store.content(0) != content_hash(segment.replace(goal=None))
     made = scene(store[0], [0], LaneGraph(segment.road))
     end = made.whole_route(0, 0, int(made.route_logged[0, 0]))[-1].numpy() + segment.origin[:2]
@@ -306,7 +308,7 @@ def test_the_ego_of_a_planning_problem_is_on_its_way_to_the_goal(path, tmp_path,
     saved = save_simulation(tmp_path / "sim", agent, dataset, config, planner="idm")
     (row,) = report(saved, "ego").rows
     assert (row["failed"], row["collision"], row["offroad_time"]) == ("", False, 0)
-    assert row["progress"] > 20
+    assert (row["progress"] > 20, saved[0].segment.goal) == (True, segment.goal)
     assert [row["progress_ratio"], row["log_distance"], run_score(row), pdm(row, saved[0], [])] == [None] * 4
 
 

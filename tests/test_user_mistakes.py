@@ -171,7 +171,8 @@ def test_a_command_that_failed_leaves_nothing_in_the_way(store: Path, run: Path,
 
 
 @pytest.mark.parametrize(("body", "reason"), [
-    ("__import__('sys').exit()", "called sys.exit(None)"),
+    ("__import__('sys').exit()", "raised SystemExit()"),
+    ("(_ for _ in ()).throw(__import__('asyncio').CancelledError())", "raised CancelledError()"),
     ("(*seen.ego[:2], 2e5, 1.0)", "a heading of 200000 rad"), ("missing", "missing"),
     ("[seen.ego[:4], (1e6, 0, 0, 0)]", "a trajectory past 100000 m"),
 ])  # fmt: skip

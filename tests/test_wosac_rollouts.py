@@ -109,8 +109,9 @@ def test_vehicles_are_driven_and_people_walk_on(settings, monkeypatch):
     found = wosac_rollouts(small(), segment, settings)
     assert found.object_id.tolist() == [100, 102, 103, 104]
     assert all(getattr(found, name).shape == (32, 4, 10) for name in STATES)
-    start, steady = segment.origin[0] + segment.position[0, 10, 0], constant_velocity(segment, 10).x[:, 0]
-    assert (np.abs((found.x[:, 0] - start) / (steady - start) - 1) < 0.5).all()
+    start, steady = segment.origin[0] + segment.position[0, 10, 0], constant_velocity(segment, 10)
+    assert (np.abs((found.x[:, 0] - start) / (steady.x[:, 0] - start) - 1) < 0.5).all()
+    assert same(wosac_rollouts(load_agent("constant_velocity"), segment, replace(PLAIN, horizon=1.0)), steady)
     # Every rollout is one of its own.
     assert len(np.unique(found.x[:, :, -1], axis=0)) == 32
     assert (found.z == found.z[:1, :, :1]).all()

@@ -54,10 +54,10 @@ def answer(call: Any, *args: Any, seconds: float = SECONDS) -> Any:
             return call(*args)
     except _Overdue as late:
         return TimeoutError(f"took more than {seconds:g} s{late}")
-    except SystemExit as ended:
-        return RuntimeError(f"called sys.exit({ended.code!r})")
-    except Exception as error:  # whatever a user's planner raises
-        return error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # whatever a user's planner raises: a cancelled task is no Exception
+        return error if isinstance(error, Exception) else RuntimeError(f"raised {error!r}")
 
 
 @contextlib.contextmanager

@@ -118,7 +118,7 @@ class Scenario:
         route: [P, 2] points to follow, 3 m apart, from beside the ego on: the feasible route nearest to the log. It
             reaches 200 m beyond what can be driven in the segment, or to where the lanes end; empty where the ego is
             on no lane. Each :class:`Traffic` has the part ahead.
-        goal: [2] where the ego's log ends.
+        goal: [2] where the ego is to come past, or its log ends.
         road: lanes with their successors and speed limits, boundary and marks.
         signal_lane: [Q] index of the lane each light controls.
         signal_point: [Q, 2] its stop point.
@@ -275,7 +275,7 @@ def scenario_of(segment: RunSegment, ego: int, route: NDArray[Any], state: NDArr
         size=fixed(segment.size[ego, :2].astype(np.float64)),
         state=fixed(state.astype(np.float64)),
         route=fixed(route.astype(np.float64)),
-        goal=fixed(position[np.flatnonzero(valid)[-1]]),
+        goal=fixed(np.array(segment.goal or position[np.flatnonzero(valid)[-1]])),
         road=_fixed_road(segment.road),
         signal_lane=fixed(segment.signal_lane),
         signal_point=fixed(segment.signal_point[:, :2].astype(np.float64)),

@@ -281,7 +281,7 @@ def tensors_of(saved: SavedRollouts) -> tuple[dict[str, NDArray[Any]], dict[str,
                 arrays[name] = value
     facts: dict[str, Any] = {name: kind(getattr(segment, name)) for name, kind in _SCALARS.items()}
     facts |= {"start": saved.start, "drivers": list(saved.drivers)}
-    facts |= {"logged": int(segment.logged)} if segment.logged else {}
+    facts |= {name: held for name in ("logged", "goal") if (held := getattr(segment, name))}
     facts["failed"] = {str(number): reason for number, reason in saved.failed.items()}
     facts |= {} if trees is None else {"prune_every": int(trees.prune_every)}
     # Only contiguous arrays are written as they are meant.
@@ -308,7 +308,7 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
     if "log_weight" in arrays:
         raise DataError("is of a search with a tilt, which was removed: simulate again", field="log_weight")
     kinds = {**_SCALARS, "start": int, "drivers": list, "failed": dict, "logged": int}
-    facts = {"logged": 0, **facts}
+    facts = {"logged": 0, "goal": None, **facts}
     for name, kind in (kinds | {"prune_every": int} if "prune_every" in facts else kinds).items():
         if type(facts[name]) is not kind:
             raise DataError(f"is {facts[name]!r:.80}, which is of the wrong type", field=name)
@@ -333,7 +333,7 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
     if "prune_every" in facts:
         trees = built(SavedTrees, "tree.", prune_every=facts["prune_every"])
     road, scalars = built(RoadMap, "road."), {name: facts[name] for name in _SCALARS}
-    segment = built(RunSegment, "log.", road=road, **scalars).replace(logged=facts["logged"])
+    segment = built(RunSegment, "log.", road=road, **scalars).replace(logged=facts["logged"], goal=facts["goal"])
     drivers = tuple(facts["drivers"])
     failed = {int(number): str(reason) for number, reason in facts["failed"].items()}
     held = {"segment": segment, "start": facts["start"], "drivers": drivers, "failed": failed, "trees": trees}

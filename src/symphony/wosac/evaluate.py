@@ -30,7 +30,7 @@ from symphony.metrics.intervals import clustered_mean
 from symphony.rollouts.workers import shared
 from symphony.wosac.scorer import CHALLENGES, SimulatedRollouts, WosacConfig, WosacScenario, check_scored, score
 from symphony.wosac.scorer.config import CURRENT, DT, FUTURE, ROLLOUTS
-from symphony.wosac.simulate import constant_velocity, wosac_rollouts
+from symphony.wosac.simulate import wosac_rollouts
 
 _AWAY, _APART = 1e5, 1e3  # metres from the origin, and from one another, at which agents do not meet anyone
 _FAR = 1e5
@@ -375,8 +375,6 @@ class _SegmentScorer:
     def _made(self, agent: Agent, window: RunSegment) -> SimulatedRollouts:
         if agent.policy is None:
             return log_playback(window)
-        if agent.name == BASELINES[1]:
-            return constant_velocity(window, self.settings.future)
         # What a search is told concerns the agent alone, which is the last one.
         plain = dataclasses.replace(self.settings, search="none")
         return wosac_rollouts(agent, window, self.settings if agent is self.agents[-1] else plain)

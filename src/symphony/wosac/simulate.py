@@ -125,6 +125,8 @@ def wosac_rollouts(agent: Agent, segment: RunSegment, settings: WosacSettings) -
     """
     if agent.policy is None:
         raise ConfigError("log playback knows the future and can't be simulated")
+    if agent.name == "constant_velocity" and agent.plan(settings.config(1, 0)).kind == "none":  # people, too
+        return constant_velocity(segment, settings.future)
     rows, held = _present(segment), standing(segment)
     segment = segment.replace(velocity=np.where(held[:, None, None], np.float32(0), segment.velocity))
     dt = DT if agent.spec is None else agent.spec.dt
