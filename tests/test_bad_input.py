@@ -108,8 +108,7 @@ def test_womd_cut_anywhere_or_with_a_flipped_bit(data: st.DataObject, shard: byt
 
 
 def test_a_huge_length_is_not_allocated(tmp_path: Path) -> None:
-    head = struct.pack("<Q", 2**62)
-    path = tmp_path / "a"
+    head, path = struct.pack("<Q", 2**62), tmp_path / "a"
     path.write_bytes(head + struct.pack("<I", masked_crc32c(head)) + b"abc\0\0\0\0")
     assert "cut short" in read_error("womd", path).message
 

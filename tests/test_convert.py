@@ -139,8 +139,7 @@ def test_an_output_may_be_a_link(logs: Write, tmp_path: Path) -> None:
 
 def test_directories_are_searched(logs: Write, tmp_path: Path) -> None:
     paths = [logs("b.scene"), logs("deep/a.scene"), logs("c.scene-00001-of-00009"), logs("a.txt")]
-    patterns = FakeReader.patterns
-    folder = tmp_path / "logs"
+    patterns, folder = FakeReader.patterns, tmp_path / "logs"
     assert expand([folder], patterns) == sorted(paths[:3])
     assert expand([paths[3], folder, paths[0]], patterns) == [paths[3], *sorted(paths[:3])]
     for nothing, message in (([tmp_path / "nowhere"], "no such file"), ([], "no files given")):

@@ -55,8 +55,7 @@ def test_it_is_the_driving_environment(store):
     segment = SegmentStore(store)[1]
     other = DrivingEnv(scene(segment, [segment.ego]), Bicycle(), SMALL)
     now = other.start(torch.tensor(0))
-    rng = np.random.default_rng(0)
-    truncated = False
+    rng, truncated = np.random.default_rng(0), False
     while not truncated:
         for name, value in now.get(("agents", "observation")).items():
             np.testing.assert_array_equal(seen[name], value[0].numpy())

@@ -218,8 +218,7 @@ def brute_force(graph, position, heading, valid):
 @pytest.mark.parametrize("make", [crossing, roundabout])
 def test_agrees_with_the_definition(make):
     graph, _ = graph_of(make())
-    rng = np.random.default_rng(5)
-    hits = 0
+    rng, hits = np.random.default_rng(5), 0
     for _ in range(10):
         lane, path = rng.integers(len(graph)), []
         for _ in range(rng.integers(1, 9)):

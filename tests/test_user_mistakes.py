@@ -127,8 +127,7 @@ def test_whatever_a_planner_holds_is_looked_at_whole(kind: str, way: str) -> Non
 
 
 def test_a_command_is_what_it_starts_and_what_that_reads(tmp_path: Path) -> None:
-    script = tmp_path / "mine.py"
-    found = []
+    script, found = tmp_path / "mine.py", []
     for text in ("a", "b"):
         script.write_text(text)
         found += [source_of(f"pipe:{sys.executable} {script}"), source_of(f"pipe:python {script}")]

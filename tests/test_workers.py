@@ -207,8 +207,7 @@ def gone(pids: list[int]) -> bool:
 
 @pytest.mark.parametrize("workers", [1, 3])
 def test_results_come_in_order_and_tasks_are_taken_as_needed(workers: int) -> None:
-    tasks = Counted(20)
-    found = []
+    tasks, found = Counted(20), []
     for result in ordered_map(slow_square, tasks, workers=workers):
         found.append(result)
         assert tasks.taken - len(found) < 2 * workers
