@@ -20,6 +20,7 @@ from symphony import keys
 from symphony.agents import load_agent
 from symphony.config import EvaluateConfig
 from symphony.data.segment import AgentType
+from symphony.data.store import SegmentStore
 from symphony.envs import DrivingEnv, scene
 from symphony.envs.observation import ObservationConfig
 from symphony.envs.scene import SceneBatch, map_edge
@@ -154,10 +155,9 @@ def test_one_that_finds_no_room_waits_until_there_is():
     scenes = crowded(segment.replace(position=position, velocity=velocity))
     late = scenes.interactive[0].tolist().index(2)
     entered = [bool(now[keys.VALID][0, late]) for now in course(looking(scenes), 30)]
-    first = entered.index(True)
     assert int(scenes.enter[0, late]) < 12
-    assert first > 15
-    assert all(entered[first:])
+    assert entered.index(True) > 15
+    assert entered == sorted(entered)
 
 
 CARS = [(60, 10, 0), (85, 10, 0), (190, 12, 1), (-6, 12, 2), (120, 0, 2)]
@@ -190,10 +190,12 @@ def test_routes_begin_where_an_agent_comes_in():
 
 
 @pytest.mark.parametrize(("search", "others"), [("none", "idm"), ("tree", "log"), ("tree", "learned")])
-def test_batch_and_padding_change_nothing(store, search, others):
+def test_batch_and_padding_change_nothing(store, search, others, tmp_path):
     driven = "all" if others == "log" else 2
     config = EvaluateConfig(rollouts=4, search=search, interactive=driven, others=others, seed=3)
-    dataset = crowd_dataset(store, tiny(), config)
+    # Real streets bend, so that the last bit of an angle counts.
+    seen = SegmentStore(brief(tmp_path / "bends", [10, 11, 12, 4], 36)) if others == "idm" else store
+    dataset = crowd_dataset(seen, tiny(), config)
     together = simulation(tiny(), dataset.scenes(range(4)), config)
     assert len({int(n) for n in dataset.scenes(range(4)).interactive_valid.sum(1)}) > 1
     for b in (0, 3):
@@ -236,7 +238,6 @@ def test_others_are_driven_but_not_evaluated(store, others, tmp_path):
     config = EvaluateConfig(rollouts=2, search="none", interactive=2, others=others)
     assert evaluate("playback", brief(tmp_path / "brief", [0]), config).numbers()["curvature_jsd"] == 0
     saved = save_simulation(tmp_path / "sim", tiny(), crowd_dataset(store, tiny(), config, [2]), config)[0]
-    assert len(saved.agents) > 2
     assert saved.evaluated.tolist() == [0, 1]
     assert set(saved.drivers[2:]) == {f"background:{others}"}
     kept = replace(config, rollouts=4, search="tree", rule="replace", threshold=np.inf)  # nothing is bad

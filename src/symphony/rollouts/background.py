@@ -95,7 +95,8 @@ class CarFollower(TensorDictModuleBase):
         driver = self.driver
         approach = speed * (speed - other) / (2.0 * math.sqrt(driver.acceleration * driver.braking))
         wanted = driver.gap + (speed * driver.headway + approach).clamp_min(0.0)
-        found = 1.0 - (speed / free.clamp_min(0.1)) ** 4 - (wanted / gap.clamp_min(0.1)) ** 2
+        # No fourth power, and no angle from atan2: their last bit on the CPU depends on the place in the batch.
+        found = 1.0 - (speed / free.clamp_min(0.1)).square().square() - (wanted / gap.clamp_min(0.1)).square()
         return (driver.acceleration * found).clamp_min(-MAX_BRAKING)
 
     def _free_speed(self, line: _Lines, station: Tensor) -> Float[Tensor, " P"]:
@@ -118,15 +119,16 @@ class CarFollower(TensorDictModuleBase):
         chosen, there = (part[:, 0] for part in nearest(squared.masked_fill(hidden, torch.inf)[:, None], _LEADERS))
         pose, box = now.state[m[:, None], chosen], now.size[m[:, None], chosen]
         along, aside, way = _project(line, pose[..., :2], _within(line, station - size[:, 0], included.VIEW))
-        turn = pose[..., 2] - way
-        cos, sin = turn.cos().abs(), turn.sin().abs()
+        facing = _unit(pose[..., 2])
+        cos = (facing * way).sum(-1).abs()
+        sin = (facing[..., 1] * way[..., 0] - facing[..., 0] * way[..., 1]).abs()
         reach = 0.5 * (cos * box[..., 0] + sin * box[..., 1])
         across = 0.5 * (sin * box[..., 0] + cos * box[..., 1])
         corridor = 0.5 * size[:, 1:] + self.driver.margin
         ahead = there & (along > station[:, None]) & (aside.abs() - across < corridor)
         gaps = torch.where(ahead, along - reach - (station + 0.5 * size[:, 0])[:, None], torch.inf)
         gap, which = gaps.min(-1)
-        speed = pose[..., 3] * way.cos() + pose[..., 4] * way.sin()
+        speed = (pose[..., 3:] * way).sum(-1)
         return gap, speed.gather(-1, which[:, None])[:, 0].clamp_min(0.0)
 
     def _red(self, line: _Lines, row: Tensor, at: Tensor, front: Tensor, speed: Tensor) -> Float[Tensor, " P"]:
@@ -242,8 +244,8 @@ def _project(
     places: Float[Tensor, "P J 2"],
     pieces: Bool[Tensor, "P pieces"] | None = None,
     about: Float[Tensor, " P"] | None = None,
-) -> tuple[Float[Tensor, "P J"], Float[Tensor, "P J"], Float[Tensor, "P J"]]:
-    """Return metres along, metres to the left, and heading of the line at its places nearest to ``places``: of
+) -> tuple[Float[Tensor, "P J"], Float[Tensor, "P J"], Float[Tensor, "P J 2"]]:
+    """Return metres along, metres to the left, and direction of the line at its places nearest to ``places``: of
     several passes of ``pieces`` the earliest (see :mod:`symphony.geometry.polylines`), or that nearest to ``about``.
     """
     start, length = line.points[:, :-1], line.arc.diff(dim=-1)
@@ -268,7 +270,7 @@ def _project(
 
     cos, sin, away = of(cos), of(sin), of(distance)
     left = cos * of(y) - sin * of(x)
-    return of(line.arc[:, None, :-1]) + of(share), torch.where(left < 0, -away, away), torch.atan2(sin, cos)
+    return of(line.arc[:, None, :-1]) + of(share), torch.where(left < 0, -away, away), torch.stack([cos, sin], -1)
 
 
 def _at(line: _Lines, station: Float[Tensor, " P"]) -> Float[Tensor, "P 2"]:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from symphony.data.segment import STATES, AgentType, RunSegment
+from symphony.data.segment import MAX_STATES, MAX_STEPS, STATES, AgentType, RunSegment
 from symphony.data.selection import MOVING, travel
 from symphony.envs.scene import beyond, map_edge
 from symphony.errors import DataError
@@ -55,17 +55,19 @@ class Onward:
         scene, and demand of their own would take as many times the rows, of which everyone is compared with all.
 
         Raises:
-            DataError: more than :data:`MOST_ENTER` vehicles would enter.
+            DataError: more than :data:`MOST_ENTER` vehicles would enter, or there would be more than can be kept.
         """
+        if steps > (most := min(MAX_STEPS, MAX_STATES // segment.num_agents)):
+            why = f"would have {steps} steps, at most {most} can be kept: simulate a shorter time"
+            raise DataError(why, segment=segment.segment_id, field="valid")
         more, last = steps - segment.num_steps, segment.num_steps - 1
         stays = segment.valid[:, last] & (travel(segment) <= MOVING)
         stays &= np.linalg.norm(segment.velocity[:, last], axis=-1) <= STANDING
         fields: dict[str, Any] = {"signal_state": continued(segment, graph, steps, self.lights)}
         for name in STATES:
             part = getattr(segment, name)
-            kept = np.where(stays.reshape(-1, *(1,) * (part.ndim - 2)), part[:, last], 0).astype(part.dtype)
-            if name == "velocity":
-                kept = np.zeros_like(kept)
+            held = (stays & (name != "velocity")).reshape(-1, *(1,) * (part.ndim - 2))
+            kept = np.where(held, part[:, last], 0).astype(part.dtype)
             fields[name] = np.concatenate([part, np.repeat(kept[:, None], more, 1)], 1)
         longer = segment.replace(**fields, logged=segment.num_steps)
         return self._entered(segment, longer, graph) if enter and self.inflow != 0 else longer
@@ -81,8 +83,8 @@ class Onward:
         step = torch.arange(first, longer.num_steps)
         arrives, which, pace = (uniform(self.seed, each, step).numpy() for each in numbers)
         at, lane = np.nonzero((arrives < rates[:, None] * log.dt).T)
-        if len(at) > MOST_ENTER:
-            why = f"{len(at)} vehicles would enter past its log, at most {MOST_ENTER} can: simulate a shorter time"
+        if len(at) > (most := min(MOST_ENTER, MAX_STATES // longer.num_steps - log.num_agents)):
+            why = f"{len(at)} vehicles would enter past its log, at most {most} can: simulate a shorter time"
             raise DataError(why, segment=log.segment_id, field="agents")
         if not len(at):
             return longer
@@ -93,11 +95,8 @@ class Onward:
         place, heading = _beginnings(log, graph, lanes[lane], size)
         speed = np.array([_pace(log, graph, lanes[k], came[by == k], u) for k, u in zip(lane, pace, strict=True)])
         count, base = len(at), log.num_agents
-        fields: dict[str, Any] = {
-            "agent_id": log.agent_id.max() + 1 + np.arange(count),
-            "agent_type": np.full(count, AgentType.VEHICLE),
-            "size": size,
-        }
+        fields: dict[str, Any] = {"agent_id": log.agent_id.max() + 1 + np.arange(count), "size": size}
+        fields["agent_type"] = np.full(count, AgentType.VEHICLE)
         found: dict[str, Any] = {
             name: np.concatenate([getattr(log, name), value.astype(getattr(log, name).dtype)])
             for name, value in fields.items()
@@ -117,12 +116,11 @@ def entrances(graph: LaneGraph) -> Indices:
     Neither such a lane nor a lane beside it has a predecessor: one that begins beside others, as a turn pocket does,
     is reached by a lane change. Of several that begin at one place it is the first.
     """
-    found: dict[tuple[int, int], int] = {}
+    found: dict[tuple[float, ...], int] = {}
     for lane in graph.usable_lanes.tolist():
         together = (lane, *graph.left[lane], *graph.right[lane])
         if not any(graph.predecessors[other] for other in together):
-            x, y = np.rint(graph.lines[lane][0]).tolist()
-            found.setdefault((x, y), lane)
+            found.setdefault(tuple(np.rint(graph.lines[lane][0]).tolist()), lane)
     return np.array(list(found.values()), np.int64)
 
 
