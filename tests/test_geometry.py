@@ -134,8 +134,7 @@ def test_a_contact_is_where_many_small_steps_find_one(a, b, c, d, size, turn):
     shapes = polygons(*geometry.pose_at(many[..., :2], many[..., 2], times), extents)
     # Without a grid shapely finds no area shared by boxes of which one covers the other to the last bit.
     shared = shapely.area(shapely.intersection(*shapes, grid_size=1e-9))
-    apart = shapely.distance(*shapes)
-    deep = shared > 1e-9
+    apart, deep = shapely.distance(*shapes), shared > 1e-9
     if deep[0]:
         # In contact from the beginning, or parting.
         assert found == (0 if deep[-1] else math.inf)

@@ -317,7 +317,7 @@ def test_runs_are_spread_over_as_many_segments_as_there_are(runs, segments, sear
         assert (count, how.rollouts) == (runs, 1)
 
 
-def test_a_hundred_runs_are_a_hundred_and_beside_the_log_the_ego_is_alone(store, tmp_path):
+def test_a_hundred_runs_are_a_hundred_and_beside_the_log_the_ego_is_alone(store, tmp_path, capsys):
     words = ["--data", str(store), "--planner", "idm", "--duration", "2", "--out", str(tmp_path / "sim")]
     assert main(["simulate", "playback", "--runs", "9", "--rollouts", "3", *words]) == 2
     assert main(["simulate", "playback", "--runs", "9", *words]) == 0
@@ -325,9 +325,10 @@ def test_a_hundred_runs_are_a_hundred_and_beside_the_log_the_ego_is_alone(store,
     assert report(found, "ego").totals()["runs"] == 9
     assert all(saved.drivers == ("idm",) for saved in found)
     assert main(["simulate", "playback", "--interactive", "2", *words[:-1], str(tmp_path / "two")]) == 1
-    words[-1] = str(tmp_path / "searched")
+    words[-1] = str(tmp_path / "a search")
     assert main(["simulate", AGENT, "--runs", "20", "--branches", "4", *words]) == 0
-    found = load_rollouts(tmp_path / "searched")
+    assert f"symphony view '{words[-1]}'" in capsys.readouterr().out
+    found = load_rollouts(Path(words[-1]))
     # 10 of each would be 20, but three trees of four branches give 12: then rather few of many segments.
     assert [entry.rollouts for entry in (*found.entries, *found.failures)] == [8, 8, 8]
 

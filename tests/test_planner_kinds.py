@@ -289,17 +289,17 @@ def test_the_command_compares_planners_among_crowds(store, tmp_path, capsys):
     assert main(["planners", *places]) == 0
     table = capsys.readouterr().out.splitlines()
     # What a suite does not save is as usual; beside the log, who enters and which lights counts, too.
-    saved = {
-        name: value for name, value in records[0]["settings"].items() if name not in ("lights", "after_collision")
-    }
+    saved = dict(records[0]["settings"])
+    del saved["lights"], saved["after_collision"]
     check_crowds([records[0] | {"settings": saved}, records[1]])
     for more in ({"inflow": 1.0}, {"lights": [5.0, 1.0, 1.0]}, {"drives": {"3": "idm"}}):
         beside = [one | {"crowd": "playback"} for one in records]
         beside[1]["settings"] = beside[1]["settings"] | more
         with pytest.raises(ConfigError, match=next(iter(more))):
             check_crowds(beside)
-    assert main(["simulate", "playback", "--others", "idm", *words, "--out", str(tmp_path / "alone")]) == 1
-    capsys.readouterr()
+    for alone in (["--others", "idm"], ["--after-collision", "stop"]):
+        assert main(["simulate", "playback", *alone, *words, "--out", str(tmp_path / "alone")]) == 1
+        assert "is all log" in capsys.readouterr().err
     assert re.match(r"\| crowd +\| +planner \| +score \|", table[0])
     assert sorted(line.split("|")[2].strip() for line in table[2:4]) == ["idm", "log"]
     assert table[-1] == winners(records)[0]

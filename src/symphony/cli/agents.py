@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import platform
+import shlex
 import shutil
 import sys
 import time
@@ -45,8 +46,8 @@ class Train(shared.Command):
         if (best := best_of(choose(folder, "last"))) is not None:
             score = f"the best one, with collision rate plus off-road time of {best.infractions:.2f} % in validation"
         shared.say(f"trained agent  {folder}\ncheckpoint     {choose(folder).name}: {score}")
-        shared.say(f"curves         symphony plot curves {folder} --out curves.png")
-        shared.say(f"evaluate it    symphony evaluate {folder} --data DIR")
+        shared.say(f"curves         symphony plot curves {shlex.quote(str(folder))} --out curves.png")
+        shared.say(f"evaluate it    symphony evaluate {shlex.quote(str(folder))} --data DIR")
 
 
 class Evaluate(shared.Simulation):

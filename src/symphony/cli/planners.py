@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from math import isnan
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
@@ -133,6 +134,6 @@ class Hunt(shared.Command):
                 rows.append([one.segment or f"mean of {known}", *told, trees, str(one.kept)])
             shared.print_table(rows, heads=1)
             if found[-1].kept:
-                shared.say(f"view them: symphony view {self.out}")
+                shared.say(f"view them: symphony view {quote(str(self.out))}")
         for remark in rare.remarks(found):
             shared.tell(remark)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import field
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
@@ -69,7 +70,7 @@ class Simulate(shared.Simulation):
         with shared.progress(f"simulating {agent.name}") as advance:
             how |= {"keep_tree": self.tree, "planner_seconds": self.planner_seconds, "progress": advance}
             found = save_simulation(self.out, agent, dataset, config, **how)
-        shared.say(f"{len(found)} run segments in {self.out}: symphony view {self.out}")
+        shared.say(f"{len(found)} run segments in {self.out}: symphony view {quote(str(self.out))}")
         why = [f"{saved.segment.segment_id}, {reason}" for saved in found for reason in saved.failed.values()]
         why += [f"{entry.segment}, {entry.failed}" for entry in found.failures for _ in range(entry.rollouts)]
         runs = sum(entry.rollouts for entry in [*found.entries, *found.failures])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import field
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
@@ -118,7 +119,8 @@ class Submit(shared.Command):
         with shared.progress(f"simulating {agent.name}", "scenarios") as advance:
             found = simulated_scenarios(agent, self.data, self.settings, lambda done: advance(done, total))
             wosac.write_submission(found, self.meta, self.out, shards)
-        shared.say(f"{total} scenarios, see symphony wosac validate {self.out} --scenario {self.data}")
+        out, data = (quote(str(path)) for path in (self.out, self.data))
+        shared.say(f"{total} scenarios, see symphony wosac validate {out} --scenario {data}")
 
 
 class Validate(shared.Command):
