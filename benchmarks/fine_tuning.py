@@ -1,6 +1,7 @@
 """Fine-tune an agent in closed loop in one of several ways, to compare them at equal updates.
 
     python benchmarks/fine_tuning.py {cloning,siblings,nearest,both,gradient} --warm-start RUN --data DIR --out DIR
+    python benchmarks/fine_tuning.py table RUNS         # of runs RUNS/WAY-SEED, evaluated on both test parts
 
 - `cloning`: the log alone, as before.
 - `siblings`: survivors of a search against those of their siblings that a rule pruned, which count as negatives, in
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -24,16 +26,21 @@ import tyro
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictSequential
 
+from methods import write
+from relations import segment_rows
 from symphony import DistillationLoss, DrivingEnv, SegmentStore, TrainConfig, keys
 from symphony.agents import Agent, bicycle, observation_of, policy_network
 from symphony.cli import guarded
 from symphony.cli.agents import Train
 from symphony.collectors import BeamSearchCollector, KeepAll, ReplaceBad, with_rows
 from symphony.config.profiles import expanded
+from symphony.evaluation.records import find_runs, kept_evaluations
+from symphony.evaluation.table import Entry
 from symphony.geometry.frames import wrap
 from symphony.learning import SceneDataset, SearchReplay, with_survivors
 from symphony.learning.experts import logged
 from symphony.learning.perturbation import way_back
+from symphony.metrics.intervals import clustered_mean
 from symphony.modules import SeededNoise
 from symphony.recipes import train
 from symphony.rollouts.search import branched_streams, collector_settings, realism_score
@@ -118,6 +125,12 @@ def blamed(replay: SearchReplay, count: int, rng: torch.Generator, observation: 
     return replay.blamed(count, rng, observation)
 
 
+TITLES = {
+    "siblings": "survivors of a search against pruned siblings",
+    "nearest": "rollouts near the log with the way back (CAT-K)",
+    "both": "half of each",
+    "gradient": "the policy gradient",
+}
 Drawn = Callable[[SearchReplay, int, torch.Generator, Any], TensorDict]
 WAYS: dict[str, tuple[Drawn, ...]] = {
     "cloning": (),
@@ -180,9 +193,35 @@ def fine_tuned(way: str) -> Callable[[TrainConfig, Processes], Trainer]:
     return recipe
 
 
+def table(runs: Path) -> None:
+    """Write how each way differs from as much cloning, paired over segments, seeds averaged, as a record."""
+    found: dict[tuple[str, str], list[Entry]] = {}
+    for run in find_runs([runs]):
+        for name, record in kept_evaluations(run).items():
+            way, seed = run.name.rsplit("-", 1)
+            facts = {"method": way, "seed": int(seed)}
+            found.setdefault((way, record["data"]["name"]), []).append(Entry(run, facts, name, record))
+    rows, seeds = [], []
+    for way, title in TITLES.items():
+        cells: list[Any] = [title]
+        for part, names in (("test", ("collision_rate", "offroad_time")), ("ngsim-test", ("collision_rate",))):
+            mine = found[way, part]
+            base = [entry for entry in found["cloning", part] if entry.seed in {each.seed for each in mine}]
+            member, (after, before) = segment_rows([mine, base], names)
+            both = zip(after, before, strict=True)
+            cells += [[round(float(x), 1) for x in clustered_mean(a - b, member)] for a, b in both]
+        rows.append(cells)
+        seeds.append(f"{title}: {len(mine)}")
+    columns = [[""], *([name, 1] for name in ("towns: collisions", "towns: off-road", "real roads: collisions"))]
+    of = f"points that 500 updates give beyond cloning (seeds of {', '.join(seeds)}), paired, ± over recordings"
+    write("fine-tuning", of, columns, rows, "fine_tuning.py table RUNS")
+
+
 def main() -> None:
-    """Train."""
+    """Train, or write the table."""
     way, *args = sys.argv[1:] or ["--help"]
+    if way == "table":
+        return table(Path(args[0]))
     if way not in WAYS:
         sys.exit(__doc__)
     config = tyro.cli(Train, args=expanded(["bc_rl", *args])).config

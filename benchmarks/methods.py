@@ -39,11 +39,14 @@ def numbers(records: Sequence[Any], keys: Sequence[str]) -> list[list[float]]:
     return [[round(float(each), digits(key)) for each in pair] for key, pair in zip(keys, averages, strict=True)]
 
 
-def write(name: str, of: str, columns: list[list[Any]], rows: list[list[Any]]) -> None:
+COMMAND = "methods.py RUN ... --towns NAME ... --roads NAME ..."
+
+
+def write(name: str, of: str, columns: list[list[Any]], rows: list[list[Any]], command: str = COMMAND) -> None:
     """Write a record, a row a line."""
     git = ["git", "rev-parse", "--short", "HEAD"]
     commit = subprocess.check_output(git, cwd=RECORDS, text=True).strip()  # noqa: S603
-    made = {"commit": commit, "command": "python benchmarks/methods.py RUN ... --towns NAME ... --roads NAME ..."}
+    made = {"commit": commit, "command": f"python benchmarks/{command}"}
     lines = [
         f" {json.dumps(k)}: {json.dumps(v, ensure_ascii=False)}"
         for k, v in (("of", of), ("made", made), ("columns", columns))
