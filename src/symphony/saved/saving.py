@@ -59,7 +59,8 @@ def save_simulation(
     """
     if drives and not planner:
         raise ConfigError("others can have a planner only beside one of the ego (`log` plays back its log)")
-    if agent.policy is None and not planner and (config.others, config.after_collision) != ("log", "go-on"):
+    after = getattr(config, "after_collision", "go-on")
+    if agent.policy is None and not planner and (config.others, after) != ("log", "go-on"):
         raise ConfigError("log playback without a planner is all log: no --others, no --after-collision")
     planners: Planners = {None: planner, **(drives or {})} if planner else {}
     config = beside_planner(config) if planner else config
