@@ -60,7 +60,7 @@ def test_a_planner_that_was_changed_is_another_simulation(store: Path, told: Any
     code, words = told(*drive(store, "--planner", "mine.py:plan", "--out", "a"))
     assert (code, "another simulation, which differs in settings" in words) == (1, True)
     code, words = told(*drive(store, "--planner", "mine.py:plan", "--out", "c[/x]"))  # which is no markup
-    assert (code, "symphony view c[/x]" in words) == (0, True)
+    assert (code, "symphony view 'c[/x]'" in words) == (0, True)
 
 
 BRAKE = """
