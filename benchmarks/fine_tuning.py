@@ -34,6 +34,7 @@ from symphony.cli import guarded
 from symphony.cli.agents import Train
 from symphony.collectors import BeamSearchCollector, KeepAll, ReplaceBad, with_rows
 from symphony.config.profiles import expanded
+from symphony.errors import ConfigError
 from symphony.evaluation.records import find_runs, kept_evaluations
 from symphony.evaluation.table import Entry
 from symphony.geometry.frames import wrap
@@ -97,7 +98,7 @@ def siblings(replay: SearchReplay, count: int, rng: torch.Generator, observation
     share = advantage.abs().amax(-1).flatten()
     pick = torch.multinomial(share + 1e-9, count, replacement=True, generator=rng)
     weight = NEGATIVE * advantage.flatten(0, -2)[pick] / share[pick].clamp_min(1e-6)[:, None]
-    return replay._learned(tree.flatten()[pick], observation).set(keys.WEIGHT, weight)
+    return replay.learned(tree.flatten()[pick], observation).set(keys.WEIGHT, weight)
 
 
 def relabelled(replay: SearchReplay, count: int, rng: torch.Generator, observation: Any) -> TensorDict:
@@ -114,15 +115,10 @@ def relabelled(replay: SearchReplay, count: int, rng: torch.Generator, observati
     )
     flat = size.flatten(0, 1)
     label = env.dynamics.towards(state, way_back(state, now, after, flat[:, 0], env.dt), flat, env.dt)
-    batch = replay._learned(chosen, observation)
+    batch = replay.learned(chosen, observation)
     both = known[scene, step] & known[scene, step + 1] & batch[keys.VALID]
     batch.set(keys.VALID, both).set(keys.ACTION, label.view(both.shape))
     return batch.set(keys.WEIGHT, both.float())
-
-
-def blamed(replay: SearchReplay, count: int, rng: torch.Generator, observation: Any) -> TensorDict:
-    """Return steps [count] with the weights of a policy gradient."""
-    return replay.blamed(count, rng, observation)
 
 
 TITLES = {
@@ -137,7 +133,7 @@ WAYS: dict[str, tuple[Drawn, ...]] = {
     "siblings": (siblings,),
     "nearest": (relabelled,),
     "both": (siblings, relabelled),
-    "gradient": (blamed,),
+    "gradient": (SearchReplay.blamed,),
 }
 
 
@@ -182,9 +178,8 @@ def fine_tuned(way: str) -> Callable[[TrainConfig, Processes], Trainer]:
             )
             each = config.search.states // max(1, len(replays))
             found = [drawn(replay, each, rng, observation) for drawn, replay in replays]
-            none = experts.clone().set(keys.ROLLOUT, torch.ones_like(experts[keys.VALID]))
-            none.set(keys.WEIGHT, torch.zeros_like(experts[keys.VALID]).float())
-            yield "policy", policy_loss(with_survivors(experts, torch.cat(found) if found else none))
+            experts.set(keys.ROLLOUT, torch.zeros_like(experts[keys.VALID]))
+            yield "policy", policy_loss(with_survivors(experts, torch.cat(found)) if found else experts)
 
         phases = [Phase(config.steps, update, cosine(config.rates(optimizers), config.steps))]
         first = replays[0][1] if replays else None
@@ -205,6 +200,8 @@ def table(runs: Path) -> None:
     for way, title in TITLES.items():
         cells: list[Any] = [title]
         for part, names in (("test", ("collision_rate", "offroad_time")), ("ngsim-test", ("collision_rate",))):
+            if lost := [each for each in (way, "cloning") if (each, part) not in found]:
+                raise ConfigError(f"{runs}: no run of {lost[0]} has an evaluation on {part}")
             mine = found[way, part]
             base = [entry for entry in found["cloning", part] if entry.seed in {each.seed for each in mine}]
             member, (after, before) = segment_rows([mine, base], names)
@@ -220,7 +217,7 @@ def table(runs: Path) -> None:
 def main() -> None:
     """Train, or write the table."""
     way, *args = sys.argv[1:] or ["--help"]
-    if way == "table":
+    if way == "table" and len(args) == 1:
         return table(Path(args[0]))
     if way not in WAYS:
         sys.exit(__doc__)

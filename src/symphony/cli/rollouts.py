@@ -103,11 +103,10 @@ class View(shared.Command):
             folders[0].of(lost[0])  # says that there is none
         folders = [folder.only(names) for folder in folders]
         out = self.folders[0] / "view.html" if self.out is None else self.out
-        page = out.suffix.lower() == ".html"
-        if page and self.rollouts:
+        if self.rollouts and out.suffix.lower() == ".html":
             raise errors.ConfigError("--rollouts is of pictures and films: a page plays all rollouts")
         with files.lock_file(out) if self.out is None else nullcontext():
-            if page:
+            if out.suffix.lower() == ".html":
                 from symphony.evaluation.report import report
 
                 write_view(folders, [report(folder, picked=True) for folder in folders], out)

@@ -109,9 +109,9 @@ class SearchReplay:
         Returns:
             TensorDict [K, N]: observation, ``ACTION``, ``ROLLOUT`` (True).
         """
-        return self._learned(_drawn(self.env, self.leaves, count, rng), observation)
+        return self.learned(_drawn(self.env, self.leaves, count, rng), observation)
 
-    def _learned(self, chosen: TensorDictBase, observation: ObservationConfig) -> TensorDict:
+    def learned(self, chosen: TensorDictBase, observation: ObservationConfig) -> TensorDict:
         """Return steps [K] as a policy observes them, with their actions."""
         batch = DrivingEnv(self.env.scenes, self.env.dynamics, observation).at(chosen)
         batch.set(keys.ACTION, chosen.get(keys.ACTION))
@@ -134,7 +134,7 @@ class SearchReplay:
         pick = torch.multinomial(share.cpu(), count, replacement=True, generator=rng).to(share.device)
         # Divided by how likely each was drawn: the mean is that over all states.
         weight = found.flatten(0, -2)[pick] * (share.mean() / share[pick])[:, None]
-        return self._learned(self.leaves.flatten()[pick], observation).set(keys.WEIGHT, PRICE * weight)
+        return self.learned(self.leaves.flatten()[pick], observation).set(keys.WEIGHT, PRICE * weight)
 
     def both_kinds(self, rng: torch.Generator) -> TensorDict:
         """Return simulated states, pruned ones included, and logged states of the same scenes.

@@ -41,7 +41,8 @@ class Network:
     edge_names: list[str]
     successors: NDArray[np.int64]  # [E, 2] lanes (from, to)
     connectors: dict[str, list[tuple[int, int, int]]]  # per light (link, connector it controls, lane before)
-    stop_lanes: dict[int, int]  # the lane at the kerb of each edge that ends at a stop sign -> 1, or -1: kerb left
+    stop_lanes: list[int]  # the lane at the kerb of each edge that ends at a stop sign
+    side: int  # of the kerb: 1 right, -1 left
     junction_shapes: list[Doubles]  # the paved area of each junction
     centers: Doubles  # [J, 2] junctions where at least three streets meet or lanes split or join, or middles of roads
 
@@ -116,7 +117,7 @@ def read_network(file: Path) -> Network:
             speed.append(float(lane.attrib["speed"]))
             internal.append(element.get("function") == "internal")
             edge.append(len(names) - 1)
-    successors, stops = set(), set()
+    successors, stops, shapes, centers = set(), set(), [], []
     connectors: dict[str, list[tuple[int, int, int]]] = {}
     for link in root.iter("connection"):
         start, end = (index.get(f"{link.attrib[which]}_{link.attrib[f'{which}Lane']}") for which in ("from", "to"))
@@ -128,7 +129,6 @@ def read_network(file: Path) -> Network:
             connectors.setdefault(link.attrib["tl"], []).append((int(link.attrib["linkIndex"]), via, start))
         if link.get("state") in {"s", "w"}:
             stops.add([k for k, own in enumerate(edge) if own == edge[start]][::side][0])
-    shapes, centers = [], []
     for junction in root.iter("junction"):
         outline = shape(junction.get("shape", ""))
         if junction.get("type") == "internal" or len(outline) < 3:
@@ -150,7 +150,8 @@ def read_network(file: Path) -> Network:
         names,
         np.array(sorted(successors), dtype=np.int64).reshape(-1, 2),
         connectors,
-        dict.fromkeys(sorted(stops), side),
+        sorted(stops),
+        side,
         shapes,
         np.array(centers).reshape(-1, 2),
     )
@@ -199,7 +200,7 @@ def crop_network(network: Network, center: Doubles, radius: float) -> Crop:
     right = np.flatnonzero(same & ~network.internal[kept[:-1]])
     left = np.stack([right, right + 1], -1).astype(np.int32)
     ends = {k: lines[i][-1] for i, k in enumerate(kept) if whole_end[i]}
-    marks = [_beside(lines[place[k]], network.width[k], side) for k, side in network.stop_lanes.items() if k in ends]
+    marks = [_beside(lines[place[k]], network.width[k], network.side) for k in network.stop_lanes if k in ends]
     kinds = np.where(network.speed[kept] > _FREEWAY_SPEED, LaneType.FREEWAY, LaneType.SURFACE_STREET)
     road = RoadMap(
         lanes=Polylines.of(lines),
