@@ -6,6 +6,7 @@ import dataclasses
 import importlib.util
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 import shapely
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -42,6 +44,7 @@ from symphony.envs.routes import route_table
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.logs import measure, shortfalls
 from symphony.roadgraph import LaneGraph, route_errors
+from test_geometry import polygons
 
 needs_sumo = pytest.mark.skipif(
     importlib.util.find_spec("sumo") is None, reason="SUMO is not installed (pip install 'symphony-traffic[sumo]')"
@@ -112,14 +115,11 @@ def test_an_interrupted_store_is_continued(tmp_path: Path, monkeypatch: pytest.M
     assert whole.complete
     assert whole.failed
 
-    class StoppedError(Exception):
-        pass
-
     real, left = StoreWriter.append, [0]
 
     def append(self: StoreWriter, *args: Any, **options: Any) -> int:
         if left[0] == 0:
-            raise StoppedError
+            raise KeyboardInterrupt
         left[0] -= 1
         return real(self, *args, **options)
 
@@ -131,7 +131,7 @@ def test_an_interrupted_store_is_continued(tmp_path: Path, monkeypatch: pytest.M
         try:
             state = generate(plan, tmp_path / "broken")
             break
-        except StoppedError:
+        except KeyboardInterrupt:
             assert not SegmentStore(tmp_path / "broken").report["generation"]["complete"]
     assert attempts > 6
     store = SegmentStore(tmp_path / "broken")
@@ -287,17 +287,6 @@ def ends(road: RoadMap) -> tuple[NDArray[Any], NDArray[Any]]:
     return points[offsets[:-1]], points[offsets[1:] - 1]
 
 
-def boxes(segment: RunSegment, step: int) -> NDArray[Any]:
-    """Rectangles of the agents seen at a step."""
-    seen = segment.valid[:, step]
-    heading, half = segment.heading[seen, step], segment.size[seen, :2] / 2
-    along = np.stack([np.cos(heading), np.sin(heading)], -1)[:, None]
-    left = np.stack([-np.sin(heading), np.cos(heading)], -1)[:, None]
-    signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
-    corners = signs[:, :1] * half[:, None, :1] * along + signs[:, 1:] * half[:, None, 1:] * left
-    return shapely.polygons(segment.position[seen, step, None, :2] + corners)
-
-
 def test_segments_conform_and_keep_the_exclusions(driven: list[RunSegment]) -> None:
     """Schema, speeds, headings, lanes and the side of the boundary, and that vehicles are on the road."""
     report = check_segments(driven)
@@ -319,7 +308,9 @@ def test_segments_conform_and_keep_the_exclusions(driven: list[RunSegment]) -> N
 def test_vehicles_do_not_overlap(driven: list[RunSegment]) -> None:
     for segment in driven:
         for step in range(0, segment.num_steps, 10):
-            shapes = shapely.buffer(boxes(segment, step), -0.05, join_style="mitre")
+            seen = segment.valid[:, step]
+            now = segment.position[seen, step, :2], segment.heading[seen, step], segment.size[seen, :2]
+            shapes = shapely.buffer(polygons(*map(torch.from_numpy, now)), -0.05, join_style="mitre")
             pairs = shapely.STRtree(shapes).query(shapes, predicate="intersects")
             assert (pairs[0] == pairs[1]).all(), (segment.segment_id, step)
 
@@ -483,10 +474,10 @@ def test_streets_of_openstreetmap_are_driven_and_footways_are_not(tmp_path: Path
 
 
 @needs_sumo
-@pytest.mark.parametrize("more", ["lefthand 1", "bikelanes.guess 1", "crossings.guess 1 --walkingareas 1"])
+@pytest.mark.parametrize("more", ["lefthand", "bikelanes.guess", "crossings.guess", "no-internal-links"])
 def test_only_lanes_for_cars_count_on_either_side_of_the_road(tmp_path: Path, more: str) -> None:
     grid = "--grid --grid.number 3 --grid.length 120 --default.lanenumber 2 --default-junction-type allway_stop"
-    run_program("netgenerate", f"{grid} --sidewalks.guess true --output-file g.net.xml --{more}", tmp_path)
+    run_program("netgenerate", f"{grid} --sidewalks.guess true --output-file g.net.xml --{more} 1", tmp_path)
     file = tmp_path / "g.net.xml"
     text = file.read_text().replace('disallow="pedestrian', 'disallow="truck bus pedestrian')
     file.write_text(text.replace('from="A0A1" to="A1', 'disallow="passenger" from="A0A1" to="A1', 1))  # a turn
@@ -495,6 +486,23 @@ def test_only_lanes_for_cars_count_on_either_side_of_the_road(tmp_path: Path, mo
     assert segment.road.lane_width == pytest.approx(3.2)
     assert off_road(segment.road, segment.road.marks.points[:, :2]).min() > -0.01  # stop signs
     check_segments([segment])
+
+
+@needs_sumo
+@pytest.mark.parametrize("rule", ['allow="bus"', 'disallow="all"', 'changeLeft="authority"'])
+def test_lanes_are_beside_each_other_where_cars_may_change(tmp_path: Path, rule: str) -> None:
+    """24 streets of three lanes: the middle one has a rule of its own."""
+    run_program("netgenerate", "--grid --grid.number 3 --default.lanenumber 3 --output-file g.net.xml", tmp_path)
+    middle = r'<lane id="\w+_1"'
+    (file := tmp_path / "g.net.xml").write_text(re.sub(middle, rf"\g<0> {rule}", file.read_text()))
+    network = read_network(net := own_network(file, tmp_path))
+    lanes, left, right = (3, 1, 2) if "change" in rule else (2, 0, 0)
+    assert (~network.internal).sum() == 24 * lanes
+    assert [len(pairs) for pairs in network.beside] == [24 * left, 24 * right]
+    assert (network.beside[0] @ [-1, 1] == 1).all()
+    slow_bends(net)
+    closed = re.findall(rf'{middle} [^>]*allow="pedestrian"', net.read_text())  # to buses, too
+    assert len(closed) == 24 * (3 - lanes)
 
 
 @needs_sumo

@@ -67,18 +67,17 @@ def cut_segments(
     for focus, center in enumerate(_focuses(network, rng, rule)):
         crop = crop_network(network, center, rule.radius)
         shapely.prepare(crop.drivable)
-        found = 0
+        most = len(segments) + rule.per_focus
         offset = int(rng.integers(0, rule.steps // 2))
         last = tracks.present.shape[1] - rule.steps
         for window, start in enumerate(range(offset, last + 1, rule.steps)):
-            if found == rule.per_focus:
+            if len(segments) == most:
                 break
             result = _cut(f"{name}-f{focus}-w{window:02d}", crop, tracks, wild, start, rng, rule)
             if isinstance(result, str):
                 reasons[result] += 1
             else:
                 segments.append(result)
-                found += 1
     return segments, reasons
 
 
@@ -103,8 +102,7 @@ def _at_steps(traffic: Traffic) -> tuple[Traffic, Bools]:
         wild = np.atleast_2d(np.abs(sideways) > MAX_LATERAL_SPEED)
         wild[:, EVERY:] |= np.linalg.norm(acceleration, axis=-1) > MAX_ACCELERATION
         wild[:, EVERY:] |= np.abs(yaw_rate) > MAX_YAW_RATE
-    names = ("position", "heading", "velocity", "present")
-    picked = {name: getattr(traffic, name)[:, ::EVERY] for name in names}
+    picked = {name: getattr(traffic, name)[:, ::EVERY] for name in ("position", "heading", "velocity", "present")}
     lights = {light: states[:, ::EVERY] for light, states in traffic.lights.items()}
     return replace(traffic, lights=lights, **picked), wild[:, ::EVERY]
 

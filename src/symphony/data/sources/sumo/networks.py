@@ -22,9 +22,9 @@ from symphony.errors import DataError
 COMMON = (
     "--no-turnarounds true --junctions.corner-detail 8 --junctions.internal-link-detail 20 "
     "--junctions.limit-turn-speed 3.5 --default.connection.cont-pos 0 --tls.yellow.time 3 --tls.allred.time 2 "
-    "--no-warnings true"
+    "--no-warnings true --no-internal-links false"
 )
-"""Options of every network."""
+"""Options of every network; all have lanes inside junctions, which traffic would else jump across."""
 SHARPEST_ANGLE = 1.05  # radians between two streets at a junction, at least where one of them is bent
 LATERAL_ACCELERATION = 3.0
 """m/s² that the speed limits of curved streets allow for; drivers exceed limits by up to 30 %."""
@@ -181,18 +181,13 @@ def town(rng: Random, folder: Path) -> Path:
     nodes = flat @ _rotation(rng.uniform(0, 2 * np.pi)).T
     main_rows = set(rng.choice(rows, 1 + (rows > 3), replace=False).tolist())
     main_columns = set(rng.choice(columns, 1, replace=False).tolist())
-
-    def is_main(a: int, b: int) -> bool:
-        same_row, same_column = a // columns == b // columns, a % columns == b % columns
-        return (same_row and a // columns in main_rows) or (same_column and a % columns in main_columns)
-
     width = rng.uniform(3.2, 3.7)
     arterial = (int(rng.choice([2, 2, 3])), float(rng.choice([13.89, 15.65, 16.67])))
     collector = (int(rng.choice([1, 1, 2])), float(rng.choice([8.94, 11.18, 13.41])))
     links: list[_Link] = []
     for a, b in _town_links(rng, columns, rows):
         line = _street(rng, nodes, links, a, b)
-        main = is_main(a, b)
+        main = a // columns in main_rows if a // columns == b // columns else a % columns in main_columns
         lanes, speed = arterial if main else collector
         links.append(_Link(a, b, line, main, lanes, min(speed, _comfortable_speed(line))))
     net = PlainNetwork()
@@ -311,9 +306,9 @@ def _carriageway(net: PlainNetwork, rng: Random, name: str, road: Road, course: 
     """Add one direction of a freeway: base, stretch beside the on-ramp, gap, stretch beside the off-ramp, end."""
     (lanes, speed, width), (direction, curvature, longer) = road, course
     weaving = rng.random() < 0.4
-    stations = np.cumsum([0, 300 + longer, rng.uniform(180, 260), 0 if weaving else rng.uniform(120, 200)])
-    stations = np.append(stations, [stations[-1] + (0 if weaving else rng.uniform(130, 180))])
-    stations = np.append(stations, stations[-1] + 300 + longer)
+    outer = 300 + longer
+    between = [rng.uniform(180, 260), *(0 if weaving else rng.uniform(*each) for each in ((120, 200), (130, 180)))]
+    stations = np.cumsum([0, outer, *between, outer])
     shift, median, spin = stations[-1] / 2, 5.0, _rotation(direction)
 
     def along(s: Doubles, right: float | Doubles) -> Doubles:
@@ -403,13 +398,15 @@ def _limited(root: ET.Element) -> ET.ElementTree[ET.Element]:
 
 
 def slow_bends(file: Path) -> None:
-    """Let SUMO drive lorries, too, on lanes for cars, as fast as bends allow: their limits are for straight roads."""
+    """Let SUMO drive all on the lanes for cars alone, as fast as bends allow: their limits are for straight roads."""
     tree = ET.parse(file)  # noqa: S314 - written by netconvert
-    for lane in filter(for_cars, tree.iterfind("edge/lane")):
-        for rule in ("allow", "disallow"):
-            lane.attrib.pop(rule, None)
-        line = densify(shape(lane.attrib["shape"]), BEND)
-        lane.set("speed", f"{min(float(lane.attrib['speed']), _comfortable_speed(line)):.2f}")
+    for lane in tree.iterfind("edge/lane"):
+        # Buses keep off their own lanes, too: the map has none.
+        lane.set("allow", "all" if for_cars(lane) else "pedestrian")
+        lane.attrib.pop("disallow", None)
+        if for_cars(lane):
+            line = densify(shape(lane.attrib["shape"]), BEND)
+            lane.set("speed", f"{min(float(lane.attrib['speed']), _comfortable_speed(line)):.2f}")
     tree.write(file)
 
 

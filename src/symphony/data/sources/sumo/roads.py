@@ -5,6 +5,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET  # files are our own
 from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ class Network:
     edge: NDArray[np.int64]  # [L] index of the lane's edge
     edge_names: list[str]
     successors: NDArray[np.int64]  # [E, 2] lanes (from, to)
+    beside: list[NDArray[np.int64]]  # [E', 2] (lane, one to its left that cars may change to), then to the right
     connectors: dict[str, list[tuple[int, int, int]]]  # per light (link, connector it controls, lane before)
     stop_lanes: list[int]  # the lane at the kerb of each edge that ends at a stop sign
     side: int  # of the kerb: 1 right, -1 left
@@ -90,8 +92,11 @@ def shape(text: str) -> Doubles:
 
 def for_cars(lane: ET.Element) -> bool:
     """Return whether cars may use a lane."""
-    allowed = {"all", "passenger"} & {*lane.get("allow", "all").split()}
-    return bool(allowed) and "passenger" not in lane.get("disallow", "").split()
+    return _has_cars(lane.get("allow", "all")) and not _has_cars(lane.get("disallow", ""))
+
+
+def _has_cars(classes: str) -> bool:
+    return not {"all", "passenger"}.isdisjoint(classes.split())
 
 
 def read_network(file: Path) -> Network:
@@ -101,22 +106,28 @@ def read_network(file: Path) -> Network:
     lanes: list[Doubles] = []
     width, speed, internal, edge, names = [], [], [], [], []
     index: dict[str, int] = {}
+    beside: tuple[list[tuple[int, int]], ...] = [], []
     balance: Counter[str] = Counter()
     for element in root.iter("edge"):
         if element.get("function") is None:
             balance.update({element.attrib["from"]: -1})
             balance.update({element.attrib["to"]: 1})
-        if element.get("function") in {"crossing", "walkingarea"}:
-            continue
         names.append(element.attrib["id"])
         # From right to left, which is the other way round where people drive on the left.
-        for lane in list(filter(for_cars, element.iter("lane")))[::side]:
+        own = list(filter(for_cars, element.iter("lane")))[::side]
+        for lane in own:
             index[lane.attrib["id"]] = len(lanes)
             lanes.append(shape(lane.attrib["shape"]))
             width.append(float(lane.get("width", _DEFAULT_WIDTH)))
             speed.append(float(lane.attrib["speed"]))
             internal.append(element.get("function") == "internal")
             edge.append(len(names) - 1)
+        for one, other in pairwise(own if element.get("function") != "internal" else ()):
+            way = index[one.attrib["id"]], index[other.attrib["id"]]
+            # Else a lane for others is between the two.
+            near = abs(int(one.attrib["index"]) - int(other.attrib["index"])) == 1
+            beside[0].extend([way] * (near and _has_cars(one.get("changeLeft", "all"))))
+            beside[1].extend([way[::-1]] * (near and _has_cars(other.get("changeRight", "all"))))
     successors, stops, shapes, centers = set(), set(), [], []
     connectors: dict[str, list[tuple[int, int, int]]] = {}
     for link in root.iter("connection"):
@@ -149,6 +160,7 @@ def read_network(file: Path) -> Network:
         np.array(edge),
         names,
         np.array(sorted(successors), dtype=np.int64).reshape(-1, 2),
+        [np.array(ways, dtype=np.int64).reshape(-1, 2) for ways in beside],
         connectors,
         sorted(stops),
         side,
@@ -191,14 +203,10 @@ def crop_network(network: Network, center: Doubles, radius: float) -> Crop:
         whole_end.append(inside[-1] == len(local) - 1)
     place = np.full(len(network.lanes), -1)
     place[kept] = np.arange(len(kept))
-    pairs = place[network.successors]
-    pairs = pairs[(pairs >= 0).all(1)]
+    linked = (place[ways].astype(np.int32) for ways in (network.successors, *network.beside))
+    pairs, left, right = (ways[(ways >= 0).all(1)] for ways in linked)
     pairs = pairs[np.array(whole_end)[pairs[:, 0]] & np.array(whole_start)[pairs[:, 1]]]
     drivable = _drivable(network, center, radius + BOUNDARY_MARGIN)
-    # Lanes of one edge follow each other from right to left; connectors have no neighbours.
-    same = (network.edge[kept[:-1]] == network.edge[kept[1:]]) & (np.diff(kept) == 1)
-    right = np.flatnonzero(same & ~network.internal[kept[:-1]])
-    left = np.stack([right, right + 1], -1).astype(np.int32)
     ends = {k: lines[i][-1] for i, k in enumerate(kept) if whole_end[i]}
     marks = [_beside(lines[place[k]], network.width[k], network.side) for k in network.stop_lanes if k in ends]
     kinds = np.where(network.speed[kept] > _FREEWAY_SPEED, LaneType.FREEWAY, LaneType.SURFACE_STREET)
@@ -208,9 +216,9 @@ def crop_network(network: Network, center: Doubles, radius: float) -> Crop:
         lane_type=kinds.astype(np.uint8),
         speed_limit=network.speed[kept].astype(np.float32),
         lane_width=network.width[kept].astype(np.float32),
-        successors=pairs.astype(np.int32),
+        successors=pairs,
         left_neighbors=left,
-        right_neighbors=left[:, ::-1],
+        right_neighbors=right,
         boundary=Polylines.of(_boundary(drivable, radius + BOUNDARY_MARGIN)),
         marks=Polylines.of(marks),
         mark_type=np.full(len(marks), MarkType.STOP_SIGN, np.uint8),

@@ -115,8 +115,7 @@ def write_demand(
         at = starts[i]
         route, total = [at], float(length[at])
         while total < (duration - departs[i] + 30) * speed and following[at]:
-            pick = rng.choice(following[at], p=chance[at]) if chance else None
-            at = following[at][int(rng.integers(len(following[at])))] if pick is None else int(pick)
+            at = int(rng.choice(following[at], p=chance[at] if chance else None))
             route.append(at)
             total += float(length[at])
         edges = " ".join(network.edge_names[e] for e in route)
@@ -233,10 +232,9 @@ def _gaussian(paths: Doubles) -> Doubles:
     kernel /= kernel.sum()
     out = np.full_like(paths, np.nan)
     inner = out[:, _REACH : paths.shape[1] - _REACH]
-    if inner.shape[1] > 0:
-        inner[:] = 0
-        for shift, weight in enumerate(kernel):
-            inner += weight * paths[:, shift : shift + inner.shape[1]]
+    inner[:] = 0
+    for shift, weight in enumerate(kernel):
+        inner += weight * paths[:, shift : shift + inner.shape[1]]
     return out
 
 
