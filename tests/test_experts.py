@@ -21,13 +21,14 @@ from helpers_runs import tiny
 from helpers_segments import crossing, hide, straight_road
 from helpers_store import fill
 from symphony.cli import main
-from symphony.config import PerturbConfig
+from symphony.config import AgentConfig, PerturbConfig
 from symphony.data.builtin import builtin_store
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs import Bicycle, Displacement, ObservationConfig
 from symphony.envs.dynamics import bicycle_step
 from symphony.envs.routes import FollowedRoutes
+from symphony.errors import DataError
 from symphony.geometry import with_speed
 from symphony.geometry.frames import rotate, wrap
 from symphony.learning import SceneDataset, perturbation
@@ -161,6 +162,14 @@ def test_training_finds_all_that_was_prepared_by_whatever_workers(method, tmp_pa
     assert main([*command.split(), "1"]) == 0
     monkeypatch.setattr("symphony.learning.demonstrations.fit_experts", None)  # nothing is fitted again
     train(tiny(method, store, tmp_path / "run"))
+
+
+@pytest.mark.parametrize(("method", "cars"), [("bc", 1), ("bc_ts", 3)])
+def test_logs_that_show_nobody_drive_on_are_named(method, cars, tmp_path):
+    """Neither the ego, which alone is driven, nor, of one car, anybody to imitate."""
+    fill(tmp_path / "store", [hide(straight_road(cars), 0, slice(1, None))])
+    with pytest.raises(DataError, match=r"segment straight-0, field valid: .*none of which shows how a"):
+        train(tiny(method, tmp_path / "store", tmp_path / "run", agent=AgentConfig(interactive=1)))
 
 
 def test_another_action_space_or_duration_is_kept_apart(store: Path) -> None:

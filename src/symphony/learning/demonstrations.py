@@ -12,7 +12,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -143,7 +143,9 @@ class SceneDataset:
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
         self.routes, self.duration, self.keep, self.few_shapes = routes, duration, keep, few_shapes
-        self.scene = ItemCache(self._prepared, _nbytes, keep=keep, name="prepared run segments")
+        self.scene = ItemCache(
+            lambda items: [self._scene(i) for i in items], _nbytes, keep=keep, name="prepared run segments"
+        )
         self.experts = ItemCache(self.fit, attrgetter("nbytes"), keep=keep, name="demonstrations")
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
@@ -217,13 +219,9 @@ class SceneDataset:
         graph, segment = self.graph(i) if self.routes else None, self.segment(i)
         return scene(segment, self.interactive, graph, number=i)
 
-    def _prepared(self, items: Sequence[int]) -> list[SceneBatch]:
-        return [self._scene(i) for i in items]
-
     def scenes(self, items: Sequence[int]) -> SceneBatch:
         """Return several items as one padded batch."""
-        found: SceneBatch = self._batch(tuple(items))
-        return found
+        return self._batch(tuple(items))
 
     def fit(self, items: Sequence[int]) -> list[Experts]:
         """Return the demonstrations of several items: those in the store, the others fitted together and kept."""
@@ -236,6 +234,14 @@ class SceneDataset:
             self.kept.save(contents[k], experts)
             known[k] = experts
         return [experts for experts in known if experts is not None]
+
+    def pick(self, states: int, count: int, items: Sequence[int], rng: torch.Generator) -> Int[Tensor, " K"]:
+        """Return some of the states in the logs of items at random; a :class:`DataError` if they have none."""
+        if not states:
+            why = f"is the first of {len(items)} run segments drawn, none of which shows how a vehicle drives on"
+            name = self.store.ids[self.indices[items[0]]]
+            raise DataError(why, file=self.store.path, segment=name, field="valid")
+        return torch.randint(states, (count,), generator=rng)
 
     def draw(self, count: int, rng: torch.Generator) -> list[int]:
         """Return different items at random (all, if there are fewer)."""
@@ -259,7 +265,7 @@ class SceneDataset:
         places = [expert.valid.nonzero(as_tuple=True) for expert in found]
         sizes = torch.tensor([len(which) for which, _ in places])
         scenes = self.scenes(items)
-        pick = torch.randint(int(sizes.sum()), (states,), generator=rng)
+        pick = self.pick(int(sizes.sum()), states, items, rng)
         item = torch.repeat_interleave(torch.arange(len(items)), sizes)[pick]
         which, when = (torch.cat(parts)[pick] for parts in zip(*places, strict=True))
         ends = torch.tensor([len(expert.agent) for expert in found]).cumsum(0)
@@ -268,8 +274,7 @@ class SceneDataset:
         lengths = torch.cat([torch.full((len(e.agent),), e.states.shape[1]) for e in found])
         begin = lengths.cumsum(0) - lengths
         state = torch.cat([e.states.flatten(0, 1) for e in found])[begin[row] + when]
-        ordinal = torch.arange(len(lengths))
-        action = torch.cat([e.actions.flatten(0, 1) for e in found])[begin[row] - ordinal[row] + when]
+        action = torch.cat([e.actions.flatten(0, 1) for e in found])[begin[row] - row + when]
         action = action.long() if self.dynamics.discrete else action
         agent = torch.cat([e.agent for e in found])[row]
         if perturb is not None:
@@ -315,7 +320,7 @@ class SceneDataset:
         each = self.experts.many(items)
         first_steps = [expert.valid.int().argmax(1).tolist() for expert in each]
         found = [(i, k, t) for i, begins in enumerate(first_steps) for k, t in enumerate(begins)]
-        pick = None if count is None else torch.randint(len(found), (count,), generator=rng).tolist()
+        pick = None if count is None else self.pick(len(found), count, items, rng).tolist()
         chosen = found if pick is None else [found[k] for k in pick]
         item, _, when = torch.tensor(chosen).unbind(1)
         tables = [each[i].routes[k] for i, k, _ in chosen]

@@ -128,14 +128,12 @@ def _fit(
 ) -> list[tuple[Tensor, Tensor]]:
     """Return actions [K, T - 1(, 2)], joint indices as int16, and states [K, T, 4] of the rows of each segment."""
     found: dict[int, tuple[Tensor, Tensor]] = {}
-    for dt in dict.fromkeys(segment.dt for segment in segments):
-        group: list[int] = []
-        waiting = [k for k, segment in enumerate(segments) if segment.dt == dt]
-        for place, k in enumerate(waiting):
-            group.append(k)
-            if place == len(waiting) - 1 or sum(len(rows[g]) for g in group) >= TOGETHER:
-                found.update(_fit_together(segments, rows, group, dynamics))
-                group = []
+    number = np.cumsum([len(each) for each in rows]) // TOGETHER
+    groups: dict[tuple[float, int], list[int]] = {}
+    for k, segment in enumerate(segments):
+        groups.setdefault((segment.dt, number[k]), []).append(k)
+    for group in groups.values():
+        found.update(_fit_together(segments, rows, group, dynamics))
     return [found[k] for k in range(len(segments))]
 
 

@@ -49,10 +49,9 @@ def prepare(
         raise DataError("can't keep demonstrations there", file=store.path / "experts")
     missing = [i for i in range(len(data)) if data.kept.load(store.content(i)) is None]
     yield len(data) - len(missing), len(data)
-    parts = [missing[first : first + TOGETHER] for first in range(0, len(missing), TOGETHER)]
     sent, done = pickle.dumps(data), len(data) - len(missing)
-    results = ordered_map(_prepared, ((sent, part) for part in parts), workers=workers, engine=engine)
-    with closing(results):
+    tasks = ((sent, missing[first : first + TOGETHER]) for first in range(0, len(missing), TOGETHER))
+    with closing(ordered_map(_prepared, tasks, workers=workers, engine=engine)) as results:
         for count in results:
             done += count
             yield done, len(data)

@@ -170,7 +170,8 @@ class SearchReplay:
         self._fitted = self._fitted or self.data.fitted(scenes.segment.tolist(), scenes)
         state, logged, progress, *_ = self._fitted
         rows = logged[:, 1:].any(-1).nonzero()
-        scene, step = rows[torch.randint(len(rows), (count,), generator=rng).to(rows.device)].unbind(-1)
+        pick = self.data.pick(len(rows), count, scenes.segment.tolist(), rng)
+        scene, step = rows[pick.to(rows.device)].unbind(-1)
         step = step + 1
         valid = logged[scene, step]
         # Agents that see no routes follow none.
