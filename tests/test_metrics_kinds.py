@@ -123,7 +123,6 @@ def crowd(seed, lead=(3, 4), agents=6, subjects=3):
     return scene(log, speed[..., None].expand(heading.shape), size, subject.reshape(*lead, subjects))
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_every_first_collision_has_a_kind(seed):
     inputs = crowd(seed)
@@ -137,7 +136,6 @@ def test_every_first_collision_has_a_kind(seed):
     assert torch.equal(found.playback, hit & ~listed)
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(-3, 3), st.booleans())
 def test_rotation_shift_and_mirror_change_nothing(seed, angle, mirror):
     inputs = crowd(seed)
@@ -155,7 +153,6 @@ def test_rotation_shift_and_mirror_change_nothing(seed, angle, mirror):
         assert torch.equal(a, b)
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_two_agents_agree_on_what_they_did(seed):
     found = collision_kinds(**crowd(seed, lead=(40,), agents=2, subjects=2))

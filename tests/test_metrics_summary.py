@@ -98,7 +98,6 @@ def test_distances_and_the_divergence_by_hand() -> None:
     assert numbers["curvature_jsd"] == pytest.approx(divergence)
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_every_rate_is_what_plain_counting_finds(seed: int) -> None:
     inputs = random_inputs(seed, agents=3)

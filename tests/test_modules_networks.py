@@ -245,7 +245,6 @@ def goals(*batch):
     return scene(*batch, valid=2.0), modules.goal_policy(6, GROUPS, 7, hidden=16)
 
 
-@settings(max_examples=20)
 @given(st.permutations(range(6)))
 @torch.no_grad()
 def test_the_order_of_routes_is_kept(order):

@@ -28,7 +28,6 @@ from symphony.errors import ConfigError, DataError
 PER_STEP = ("position", "heading", "velocity", "valid", "signal_state")
 
 
-@settings(max_examples=20, deadline=None)
 @given(segments(), st.integers(1, 4))
 def test_whole_multiples_pick_and_keep_everything_else(log: RunSegment, every: int) -> None:
     picked = log.valid[:, ::every]
@@ -39,7 +38,6 @@ def test_whole_multiples_pick_and_keep_everything_else(log: RunSegment, every: i
     np.testing.assert_array_equal(new.valid, picked)
 
 
-@settings(max_examples=20, deadline=None)
 @given(segments(), st.floats(0.15, 3))
 def test_any_ratio_gives_a_valid_segment_of_the_same_span(log: RunSegment, ratio: float) -> None:
     dt = log.dt * ratio

@@ -82,7 +82,6 @@ def test_what_is_not_finite_is_on_no_lane_and_not_silently(number):
             visited_regions(graph, path[:, :2], path[:, 2], np.ones(5, bool))
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_assignment_agrees_with_shapely(seed):
     rng = np.random.default_rng(seed)

@@ -34,7 +34,6 @@ from symphony.render import plot_curvature
 NUMBERS = st.floats(0, 100)
 
 
-@settings(max_examples=20)
 @given(st.lists(NUMBERS, min_size=1, max_size=6))
 def test_cells_are_mean_and_standard_error_over_seeds(values: list[float]) -> None:
     row = row_of(compare([make_entry("bc", k, ade=value) for k, value in enumerate(values)], "main"), "bc")
@@ -49,7 +48,6 @@ def test_the_order_of_runs_does_not_matter(entries: list[Any]) -> None:
     assert json_text(compare(entries, "main")) == json_text(compare(full_table(2), "main"))
 
 
-@settings(max_examples=20)
 @given(st.dictionaries(st.sampled_from(METHODS), st.tuples(*[NUMBERS] * 5), min_size=1))
 def test_the_lowest_value_of_each_family_is_the_best(table: dict[str, tuple[float, ...]]) -> None:
     entries = [make_entry(method, **dict(zip(METRICS, row, strict=True))) for method, row in table.items()]
@@ -261,7 +259,6 @@ def test_names_differ_with_everything_that_changes_results() -> None:
     assert [evaluation_name(record) for record in kept.values()] == list(kept)
 
 
-@settings(max_examples=20)
 @given(st.text(CHARACTERS + "/", max_size=80), st.integers(0, 9))
 def test_names_are_file_names_and_differ_however_long_they_are(store: str, paths: int) -> None:
     """An evaluation of hours was lost where its name was too long for a file."""

@@ -26,8 +26,6 @@ def joined(road: RoadMap) -> tuple[RoadMap, int]:
     within :data:`SAME`: no branch is invented where lanes are linked. Lanes of a single point stay as they are.
     """
     first, last, inward, outward, known = _ends(road)
-    if not known.any():
-        return road, 0
     # Shapely's index is flat; heights are compared below. [E] pairs of an end's lane and a start's.
     tree = shapely.STRtree(shapely.points(first[:, :2]))
     end, start = tree.query(shapely.points(last[:, :2]), predicate="dwithin", distance=REACH)

@@ -127,8 +127,6 @@ def dense(lines: Polylines) -> NDArray[np.float64]:
     step = np.diff(points, axis=0, append=points[-1:])
     step[lines.offsets[1:] - 1] = 0
     count = np.maximum(np.ceil(np.hypot(*step[:, :2].T) / SPACING), 1).astype(np.int64)
-    if count.max() == 1:
-        return points
     point = np.repeat(np.arange(len(points)), count)
     return points[point] + shares(count)[:, None] * step[point]
 

@@ -121,8 +121,7 @@ def _agents(segment: RunSegment) -> RunSegment:
         if which.any():
             found[kind] = f"agent {s.agent_id[np.argmax(which)]}"
     size[:, :2][thin] = schema.MIN_SIZE
-    left = kinds[NO_SIZE] | kinds[UNSEEN]
-    return noted(with_agents(s.replace(size=size), ~left), found)
+    return noted(with_agents(s.replace(size=size), ~(kinds[NO_SIZE] | kinds[UNSEEN])), found)
 
 
 def from_ego(segment: RunSegment) -> RunSegment:
@@ -149,6 +148,7 @@ def with_agents(segment: RunSegment, kept: Bools) -> RunSegment:
 def with_lanes(segment: RunSegment, kept: Bools) -> RunSegment:
     """Return a segment with the lanes of a mask [L], the links between them and their lights."""
     road, lights = segment.road, kept[segment.signal_lane]
+    joined = road.successors[len(road.successors) - segment.joined_gaps :]  # they are the last
     pairs = {name: getattr(road, name) for name in ("successors", "left_neighbors", "right_neighbors")}
     names = ("lane_id", "lane_type", "speed_limit", "lane_width")
     fields: dict[str, Any] = {name: getattr(road, name)[kept] for name in names}
@@ -158,6 +158,7 @@ def with_lanes(segment: RunSegment, kept: Bools) -> RunSegment:
         signal_lane=_renumbered(segment.signal_lane[lights], kept),
         signal_point=segment.signal_point[lights],
         signal_state=segment.signal_state[lights],
+        joined_gaps=int(kept[joined].all(axis=1).sum()),
     )
 
 

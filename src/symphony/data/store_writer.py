@@ -65,7 +65,7 @@ class StoreWriter(AbstractContextManager["StoreWriter"]):
         """Add one segment and return its index; a :class:`DataError` if it breaks the schema or its name is taken.
 
         Tags are anything JSON can hold, given back by :meth:`SegmentStore.tags`; not under the names ``group`` and
-        ``goal``, where the segment's are kept.
+        ``_goal``, where the segment's are kept.
         """
         segment = _plain(validate(segment))
         if wrong := {GROUP, GOAL} & (tags or {}).keys():
@@ -155,12 +155,11 @@ class _TableWriter:
         """Write rows of every column (leading dimensions are flattened) and a record; return its number."""
         record = np.zeros(1, self.table.record)
         counts = np.zeros(len(self.table.axes), np.int64)
-        for column in self.table.columns:
-            counts[self.table.axes[column.axis]] = values[column.name].nbytes // column.row.itemsize
         number, end = self.state
         for column in self.table.columns:
-            begin = int(end[self.table.axes[column.axis]]) * column.row.itemsize
-            _write_at(self._files[column.name], begin, values[column.name])
+            axis, size = self.table.axes[column.axis], column.row.itemsize
+            counts[axis] = values[column.name].nbytes // size
+            _write_at(self._files[column.name], int(end[axis]) * size, values[column.name])
         record["begin"], record["count"] = end, counts
         record["hash"] = np.frombuffer(digest, np.uint8)
         for name, value in scalars.items():
