@@ -86,9 +86,8 @@ def test_no_two_networks_are_alike(a: int, b: int, split_a: Split, split_b: Spli
 def test_bad_plans_name_the_field() -> None:
     bad = {"segments": 0, "seed": MAX_SEED + 1, "split": "dev", "kinds": (), "duration": 15, "interactive": 1}
     for field, value in [*bad.items(), ("kinds", ("village",))]:
-        given: dict[str, Any] = {"segments": 5, field: value}
         with pytest.raises(ConfigError, match=field.rstrip("s")):
-            Plan(**given)
+            Plan(**{"segments": 5, field: value})
 
 
 @pytest.mark.usefixtures("fake")
@@ -513,12 +512,13 @@ def test_opendrive_of_those_who_drive_on_the_left_is_refused(tmp_path: Path) -> 
 
 
 @needs_sumo
-@pytest.mark.parametrize("text", ["", "<OpenDRIVE/>", "<nothing", "\0"])
-def test_what_is_no_map_is_an_error_that_names_it(tmp_path: Path, text: str) -> None:
-    file = tmp_path / "roads.xodr"
-    file.write_text(text)
-    with pytest.raises(DataError, match=r"roads\.xodr"):
-        own_network(file, tmp_path)
+@pytest.mark.parametrize("text", ["", "<OpenDRIVE/>", "<nothing", "\0", '<net><edge id="a" from="\xff"/></net>'])
+def test_what_is_no_map_is_an_error_that_names_it(tmp_path: Path, text: str, monkeypatch: Any) -> None:
+    monkeypatch.setenv("LC_ALL", "C")  # as in a container: what SUMO says may then be no UTF-8
+    for name in ("roads.xodr", "roads.net.xml"):
+        (tmp_path / name).write_text(text, encoding="latin-1")
+        with pytest.raises(DataError, match=name):
+            own_network(tmp_path / name, tmp_path)
     with pytest.raises(ConfigError, match="there is no file"):
         Plan(1, kinds=("nowhere.xodr",))
 

@@ -63,10 +63,10 @@ def run_program(name: str, arguments: str, folder: Path) -> None:
     """Run one of SUMO's programs in a folder; a :class:`DataError` ends with what it said where it failed."""
     home = sumo_home()
     command = [str(home / "bin" / name), *arguments.split(), "--xml-validation", "never"]
-    environment = {**os.environ, "SUMO_HOME": str(home)}
+    env = {**os.environ, "SUMO_HOME": str(home)}
     try:
         done = subprocess.run(  # noqa: S603 - the program comes from the installed wheel and the arguments are ours
-            command, cwd=folder, env=environment, check=False, capture_output=True, text=True, timeout=TIMEOUT_SECONDS
+            command, cwd=folder, env=env, check=False, capture_output=True, errors="replace", timeout=TIMEOUT_SECONDS
         )
     except (subprocess.TimeoutExpired, OSError) as error:
         raise DataError(f"{name} could not be run: {error}") from error
