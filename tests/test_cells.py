@@ -91,8 +91,7 @@ def test_points_are_seen_as_by_the_plain_formula(scenes: SceneBatch) -> None:
     row, where = places(scenes, 3)
     rng = torch.Generator().manual_seed(1)
     pose = torch.cat([where, torch.randn(*where.shape[:2], 2, generator=rng) * 5], -1)
-    step = torch.randint(60, (len(row),), generator=rng)
-    tables = Tables(scenes, FEW)
+    step, tables = torch.randint(60, (len(row),), generator=rng), Tables(scenes, FEW)
     x, y, heading, speed = pose.clone().requires_grad_().unbind(-1)
     state = torch.stack([x, y, heading, speed * heading.cos(), speed * heading.sin()], -1)
     objects = Objects(state, torch.ones_like(x, dtype=torch.bool), state[..., :2])
@@ -113,8 +112,7 @@ def test_road_distances_and_flags_are_those_among_all_edges(scenes: SceneBatch) 
     distance = road_distance(scenes, row, where, tables)
     # Far from every edge float32 itself is coarser.
     torch.testing.assert_close(distance, expected, atol=1e-5, rtol=1e-6)
-    flags = offroad_flags(scenes, row, where, tables)
-    sure = expected.abs() > 1e-4
+    flags, sure = offroad_flags(scenes, row, where, tables), expected.abs() > 1e-4
     assert torch.equal(flags[sure], (expected > 0)[sure])
     assert 0.2 < flags.float().mean() < 0.8
     assert (distance[row == len(scenes) - 1] == NO_BOUNDARY).all()
@@ -136,8 +134,7 @@ def test_acute_corners_have_the_side_that_the_distance_says(seed: int) -> None:
     where = (corner + 1.5 * torch.from_numpy(rng.normal(size=corner.shape)).float())[None]
     tables = Tables(batch, FEW)
     expected = oracle.road_distance(batch, row, where)
-    sure = expected.abs() > 1e-3
-    flags = offroad_flags(batch, row, where, tables)
+    sure, flags = expected.abs() > 1e-3, offroad_flags(batch, row, where, tables)
     assert torch.equal(flags[sure], (expected > 0)[sure])
     assert (tables.edge_cells.sign != 0).any()
     # Whoever is alone at a corner is on the same side of it.
@@ -152,8 +149,7 @@ def test_padding_batch_and_order_change_nothing(scenes: SceneBatch) -> None:
     distance = road_distance(scenes, row, where, together)
     for b, lone in ((3, scene(SegmentStore(builtin_store("train"))[9])), (0, scene(straight_road()))):
         mine = row == b
-        zero = torch.zeros(int(mine.sum()), dtype=torch.int64)
-        alone = Tables(lone, FEW)
+        zero, alone = torch.zeros(int(mine.sum()), dtype=torch.int64), Tables(lone, FEW)
         found, _ = nearest_points(alone, zero, where[mine].flip(1))
         assert torch.equal(found.flip(1), flat[mine] - b * scenes.point.shape[1])
         assert torch.equal(road_distance(lone, zero, where[mine].flip(1), alone).flip(1), distance[mine])
@@ -180,8 +176,7 @@ def test_answers_stay_when_cells_get_their_lists_and_threads_ask_at_once(scenes,
 
 def test_collisions_are_those_of_all_pairs() -> None:
     scenes = collate([scene(crossing(7), [0, 1, 2]), scene(straight_road(5), [0, 1, 2])])
-    rng = torch.Generator().manual_seed(6)
-    row = torch.arange(2).repeat(200)
+    rng, row = torch.Generator().manual_seed(6), torch.arange(2).repeat(200)
     state = torch.randn(400, 3, 4, generator=rng) * torch.tensor([6.0, 6.0, 2.0, 3.0])
     state[..., :2] += scenes.log_state[row, 3, 2, :2][:, None]
     index, real = scenes.interactive[row], torch.rand(400, 3, generator=rng) < 0.9
@@ -229,8 +224,7 @@ def test_huge_maps_have_larger_cells() -> None:
     assert cells.nearest_points(cell, *where).tolist() == [[1]]
 
 
-HIGH = 6.0
-STEPS = 41
+HIGH, STEPS = 6.0, 41
 SEEN = ObservationConfig(num_objects=8, num_points=400, num_lights=2, clearance=True, foresight=(1.0,))
 
 
@@ -244,8 +238,7 @@ def line(axis: int, across: float, height: float, back: bool = False) -> NDArray
 
 def overpass(height: float = HIGH, slope: float = 0.0, turn: float = 0.0) -> RunSegment:
     """A road along x, and one along y at a height; a car on each is at the crossing at 4 s. All climbs along x."""
-    half = LANE_WIDTH / 2
-    lanes = [line(0, 0, 0), line(1, 0, height)]
+    half, lanes = LANE_WIDTH / 2, [line(0, 0, 0), line(1, 0, height)]
     boundary = [
         line(0, -half, 0), line(0, half, 0, back=True), line(1, half, height), line(1, -half, height, back=True),
     ]  # fmt: skip
@@ -365,7 +358,10 @@ def test_padded_slots_leave_everyone_as_high_as_they_are() -> None:
 def test_flat_scenes_beside_it_keep_every_number() -> None:
     flat = [straight_road(3, steps=STEPS), crossing(steps=STEPS)]
     alone = DrivingEnv(collate([scene(s, [0, 1]) for s in flat]), observation=SEEN)
-    mixed = DrivingEnv(collate([scene(s, [0, 1]) for s in (*flat, overpass())]), observation=SEEN)
+    shapes: dict[str, list[int]] = {}  # of a flat batch before, with more of everything
+    collate([scene(straight_road(40, steps=STEPS), [0, 1])], shapes=shapes)
+    mixed = collate([scene(s, [0, 1]) for s in (*flat, overpass())], shapes=shapes)
+    mixed = DrivingEnv(mixed, observation=SEEN)
     one, two = (env.start(torch.arange(2)) for env in (alone, mixed))
     for _ in range(5):
         for name in one.keys(True, True):

@@ -287,6 +287,8 @@ def collate(scenes: Sequence[SceneBatch], agents: int = 0, shapes: dict[str, lis
         like = {"agent": "log_valid", "point": "point_valid", "edge": "edge_valid"}.items()
         for part in (part for part in parts if not part["point_height"].shape[1]):
             part |= {f"{name}_height": torch.zeros(*part[of].shape, 2) for name, of in like}
+        if shapes:  # those before may have been of flat maps
+            shapes |= {f"{name}_height": [*shapes[of], 2] for name, of in like}
     for name in SceneBatch.__annotations__:
         values = [part[name] for part in parts]
         each = {value.shape[1:] for value in values}
