@@ -106,19 +106,9 @@ def test_turns_do_not_depend_on_where_a_route_lies(turn: float, angle: float, sh
     assert route_turns(routes, torch.tensor([9, 9])).tolist() == [1, 1]
 
 
-@pytest.mark.parametrize("angle", [0.3, 1.7, 2.9, -1.2])
-def test_a_last_piece_that_rounding_made_is_no_turn(angle: float) -> None:
-    """A lane whose length is a whole number of pieces leaves one of micrometres, in any direction."""
-    along = 100 + torch.arange(21.0)[:, None] * torch.tensor([math.cos(angle), math.sin(angle)]) * 3.0
-    ends = along[-1] + 1e-5 * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    routes = torch.cat([along.expand(4, -1, -1), ends[:, None]], 1)
-    assert route_turns(routes, torch.full((4,), 22)).tolist() == [1, 1, 1, 1]
-
-
 def test_by_hand() -> None:
     drawn = torch.tensor([[[0, -1], [0, -1], [1, -1], [2, -1]]])
-    kept = torch.tensor([[[0, -1], [0, -1]]])
-    turn = torch.tensor([[[2, 1, 0], [1, 1, 1]]])
+    kept, turn = torch.tensor([[[0, -1], [0, -1]]]), torch.tensor([[[2, 1, 0], [1, 1, 1]]])
     (one,) = choices(drawn, kept, turn, torch.tensor([2.0]))
     assert (one.drawn.tolist(), one.kept.tolist(), one.variation) == ([1, 1, 2], [0, 0, 2], 0.5)
     numbers = choice_numbers([one])

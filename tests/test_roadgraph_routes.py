@@ -125,8 +125,7 @@ def test_a_neighbour_that_has_ended_or_leads_elsewhere_is_no_lane_to_change_to()
 @pytest.mark.parametrize("movement", ["left0", "ahead0", "right0", "left2"])
 def test_ground_truth_is_the_route_that_was_driven(movement, degrees):
     road, name = crossing()
-    graph = LaneGraph(moved_road(road, degrees, [100, 50]))
-    arm = movement[-1]
+    graph, arm = LaneGraph(moved_road(road, degrees, [100, 50])), movement[-1]
     found = routes(graph, [(name[f"in{arm}"], 30.0)])
     (truth,) = [k for k, route in enumerate(found) if name[movement] in route.lanes]
     plain = LaneGraph(road)
@@ -158,8 +157,7 @@ def test_route_errors_agree_with_shapely():
     np.testing.assert_allclose(route_errors(lines, log), expected, atol=1e-6)
 
 
-lengths = st.floats(10.0, 60.0)
-curves = st.floats(-1 / 25, 1 / 25)
+lengths, curves = st.floats(10.0, 60.0), st.floats(-1 / 25, 1 / 25)
 
 
 def curved(curvature, length=150.0, aside=0.0):
@@ -171,8 +169,7 @@ def curved(curvature, length=150.0, aside=0.0):
 
 @given(curves, st.floats(-4.0, 4.0), st.floats(0.0, 60.0), lengths)
 def test_a_blend_leads_forward_onto_the_line_without_a_kink(curvature, aside, place, length):
-    line = curved(curvature)
-    point = curved(curvature, aside=aside)[round(place)]
+    line, point = curved(curvature), curved(curvature, aside=aside)[round(place)]
     way = blend(line, point, length)
     np.testing.assert_allclose(way[0], point)
     stations = np.array([beside(line, here)[0] for here in way])
@@ -245,6 +242,19 @@ def test_routes_can_be_driven(which, share, speed):
         assert all(np.hypot(*(other - line).T).max() >= 1.0 for other in same)
 
 
+def test_ways_within_a_metre_are_one_if_one_has_a_point_more():
+    ways = [[0, 0], [50, 0]], [[0, 0], [25, 0.95], [50, 0]], [[50, 0], [149.98, 0]]
+    graph = LaneGraph(make_road([np.array(way, float) for way in ways], successors=[(0, 2), (1, 2)]))
+    found = [Route((0, 2)), Route((1, 2))]
+    assert [len(resampled(route_line(graph, route), 3.0)) for route in found] == [51, 52]
+    assert route_lines(graph, found, {0: 0.0, 1: 0.0}, spacing=3.0, length=400.0)[0] == found[:1]
+
+
+def test_a_whole_number_of_pieces_has_no_last_one_that_rounding_made():
+    lines = np.float32([[100, 100], [148 + 1e-5, 136 - 1e-5]]), np.float32([[100, 100], [148 + 1e-5, 136]])
+    assert [len(resampled(np.float64(line), 3.0)) for line in lines] == [21, 21]
+
+
 def test_a_lane_that_ends_inside_the_map_says_so():
     def line(*points):
         return np.array(points, float)
@@ -278,8 +288,7 @@ def test_lanes_of_next_to_no_length_in_a_circle(size):
 def test_going_around_the_block_first_is_not_the_way_of_the_log():
     # A street that leads back into itself, and on: 0 leads to 1 and, by the loop 2, to its own start.
     street = np.stack([np.linspace(0.0, 30.0, 16), np.zeros(16)], -1)
-    onward = street + np.array([30.0, 0.0])
-    angle = np.linspace(0.0, 2.0 * np.pi, 60)[:, None]
+    onward, angle = street + np.array([30.0, 0.0]), np.linspace(0.0, 2.0 * np.pi, 60)[:, None]
     loop = np.array([30.0, 0.0]) + 8.0 * np.concatenate([np.sin(angle), 1 - np.cos(angle)], -1)
     loop = np.concatenate([loop[:45], [[10.0, 20.0], [-10.0, 10.0], [-5.0, 0.0], [0.0, 0.0]]])
     graph = LaneGraph(make_road([street, onward, loop], successors=[(0, 1), (0, 2), (2, 0)]))

@@ -37,7 +37,7 @@ from symphony.roadgraph import LaneGraph, lane_of
 IN_LANE = 1.0
 """Metres from a centre line within which a standing vehicle is taken to wait rather than to be parked."""
 
-VERSION = 6
+VERSION = 7
 """Version of the fit: raised when it gives other numbers or routes for the same segment (a test says when)."""
 PACKAGE = Path(symphony.__file__).parent
 _TENSORS = ("agent", "states", "actions", "valid", "error", "progress")

@@ -18,7 +18,6 @@ from symphony.geometry import wrap
 
 TURNS = ("right", "straight", "left")
 TURNED = math.radians(45)  # a route turns where its direction has changed by this much since its beginning
-SHORTEST = 0.01  # metres of a piece of a route that has a direction
 
 
 def route_turns(
@@ -32,8 +31,6 @@ def route_turns(
     direction = torch.atan2(step[..., 1], step[..., 0])
     change = wrap(direction.diff(dim=-1)).cumsum(-1)
     exists = torch.arange(change.shape[-1], device=points.device) < (count[..., None] - 2)
-    # The last piece of a route may be so short that rounding decides its direction.
-    exists &= step[..., 1:, :].norm(dim=-1) > SHORTEST
     turns = (change.abs() > turned) & exists
     first = turns.int().argmax(-1, keepdim=True)
     way = change.gather(-1, first).squeeze(-1).sign().long()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +26,7 @@ CHANGE_TURN = np.radians(25.0)
 """Largest angle between two lanes where one changes, and what a change may turn more within 3 m than the lanes do."""
 CHANGE_WIDTH = 7.0  # metres between the centre lines of two lanes beside each other, at most
 SAME = 1.0  # metres within which two routes are one
-_TIE = 1e-3
+_TIE, _SHORTEST = 1e-3, 0.01
 _SLACK = 30.0  # metres of a route beyond 1.5 times the way driven that are compared with it
 _RETURN_METRES, _RETURN_WIDTH = 25.0, 6.0
 """Metres farther along, and metres of distance, at which a line counts as passing a place twice."""
@@ -249,9 +249,11 @@ def route_lines(
         points = resampled(line, spacing, length)
         # Lines that are the same have last points in one cell, or in cells side by side.
         count, (x, y) = len(points), np.floor(points[-1] / SAME).astype(int).tolist()
-        around = ((count, i, j) for i in (x - 1, x, x + 1) for j in (y - 1, y, y + 1))
+        around = product((count - 1, count, count + 1), (x - 1, x, x + 1), (y - 1, y, y + 1))
         close = (lines[k] for cell in around for k in ends.get(cell, ()))
-        if any(np.hypot(*(line - points).T).max() < SAME for line in close):
+        # One may have a point more before its last.
+        pairs = ((line, [*range(min(len(line), count) - 1), -1]) for line in close)
+        if any(np.hypot(*(line[both] - points[both]).T).max() < SAME for line, both in pairs):
             continue
         ends.setdefault((count, x, y), []).append(len(lines))
         kept.append(route)
@@ -306,10 +308,12 @@ def ends_inside(graph: LaneGraph, line: Reals) -> bool:
 
 
 def resampled(line: Reals, spacing: float, length: float = np.inf) -> Reals:
-    """Return points [Q, 2], Q >= 2, of a line ``spacing`` metres apart, up to a length; the last may be nearer."""
+    """Return points [Q, 2], Q >= 2, of a line ``spacing`` metres apart, up to a length; the last may be nearer, but
+    not by so little that rounding decided the direction of its piece.
+    """
     arc = paths.arc_lengths(line)
     end = min(length, arc[-1])
-    places = np.append(np.arange(0.0, end - 1e-6, spacing), end)
+    places = np.append(np.arange(0.0, end - _SHORTEST, spacing), end)
     return paths.at(line, arc, places if len(places) > 1 else np.array([0.0, end]))
 
 
