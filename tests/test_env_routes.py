@@ -12,7 +12,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from helpers_segments import CAR, LANE_WIDTH, crossing, make_road, make_segment, straight_road
+from helpers_segments import CAR, LANE_WIDTH, crossing, hide, make_road, make_segment, straight_road
 from symphony import DrivingEnv, ObservationConfig, keys
 from symphony.agents import load_agent
 from symphony.config.evaluation import SimulateConfig
@@ -143,8 +143,7 @@ def test_what_else_is_in_the_table_changes_nothing(count, seed):
     progress = torch.from_numpy(rng.uniform(0, 3 * count, (1, 2)))
     for one, other in zip(found.window(progress), one_route(line).window(progress[:, :1]), strict=True):
         assert torch.equal(one[:, :1], other)
-    place = state[..., :2].expand(1, 2, 2)
-    moved = torch.from_numpy(rng.uniform(0, 3, (1, 2)))
+    place, moved = state[..., :2].expand(1, 2, 2), torch.from_numpy(rng.uniform(0, 3, (1, 2)))
     alone = one_route(line).progress(place[:, :1], progress[:, :1], moved[:, :1])
     assert torch.equal(found.progress(place, progress, moved)[:, :1], alone)
     features, mask = route_choices(state.expand(1, 2, 4), routes.among(torch.tensor([1])), change[1:], SCALE)
@@ -356,17 +355,20 @@ def test_who_has_not_changed_lanes_took_no_route_that_does(steps):
     assert choices_of(torch.zeros(1, 1, 4).double(), table.line(0).astype(float))[..., -1] == 0
 
 
-def test_who_drives_under_a_bridge_has_no_route_over_it():
+def test_who_drives_under_a_bridge_has_no_route_over_it_and_follows_nobody_there():
     segment = straight_road(2, num_lanes=1, steps=21)
     lane = segment.road.lanes[0]
     road = make_road([lane, lane + np.array([0.0, 0.5, 6.0], np.float32)])
     for height, aside in ((0.0, 0.0), (6.0, 0.5)):
         position = segment.position.copy()
         position[..., 1] += lane[0, 1] - position[0, 0, 1]
-        position[..., 2] = height + 0.5 * segment.size[:, None, 2]
-        table = route_table(segment.replace(position=position, road=road), LaneGraph(road), 0)
+        position[..., 2] = np.array([[height], [6.0 - height]]) + 0.5 * segment.size[:, None, 2]
+        made = segment.replace(position=position, road=road)
+        table = route_table(made, LaneGraph(road), 0)
         assert len(table.count) == 1
         np.testing.assert_allclose(table.line(0)[:, 1], lane[0, 1] + aside, atol=1e-4)
+        pair = collate([scene(each, [0], LaneGraph(road)) for each in (made, hide(made, 1, slice(1, None)))])
+        assert torch.equal(*simulation(load_agent("idm"), pair, SimulateConfig(rollouts=1)).rollouts.state)
 
 
 @pytest.mark.parametrize(("ahead", "aside", "speed", "its_speed", "enters"), [

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from shapely import LineString, Point
 
 from helpers_agents import small
-from helpers_segments import CAR, LANE_WIDTH, crossing, hide, make_road, make_segment, ring, straight_road
+from helpers_segments import CAR, LANE_WIDTH, along, crossing, hide, make_road, make_segment, ring, straight_road
 from helpers_store import fill, stored
 from symphony.agents import load_agent
 from symphony.cli import main
@@ -479,6 +479,22 @@ def test_idm_stops_behind_a_standing_car_where_its_route_comes_by_twice() -> Non
         ahead = (0.2 + gap / 15 - turned) * 15.0
         assert LENGTH + 1.0 < ahead.min() <= ahead[-1] < LENGTH + 5.0
         assert found[-1, 3] < 0.5
+
+
+def test_idm_goes_around_the_block_however_long_it_waits_before() -> None:
+    """Behind one that goes straight on, at the end of a street back onto which its route leads."""
+    street, turn, time = np.arange(0.0, 61.0, 2.0), np.linspace(0, np.pi, 24), 0.2 * np.arange(351)
+    x, y = np.append(60 + 10 * np.sin(turn), -10 * np.sin(turn)), 10 - 10 * np.append(np.cos(turn), -np.cos(turn))
+    lines = [np.stack(line, -1) for line in ((street, 0 * street), (x, y), (60 + 6 * street, 0 * street))]
+    road = make_road(lines, successors=[(0, 1), (1, 0), (0, 2)])
+    path, waits = np.concatenate([*lines[:2], lines[0][1:], lines[2][1:]]), np.maximum(time - 30, 0)
+    place, heading = along(path, np.stack([np.minimum(5 + 10 * time, 45) + 10 * waits, 55 + 0 * time]))
+    place[1, :, 0] += 15 * waits
+    speed = np.stack([10.0 * ((time < 4) | (time > 30)), 15.0 * (time > 30)])[..., None]
+    segment = make_segment(road, place, heading, speed * np.stack([np.cos(heading), np.sin(heading)], -1))
+    (found,) = states(segment)
+    assert found[:, 1].max() > 19
+    assert found[-1, 0] > 100
 
 
 def test_a_car_in_the_next_lane_or_behind_is_nobody_to_follow(rows: dict[str, Any]) -> None:

@@ -56,7 +56,7 @@ class CarFollower(TensorDictModuleBase):
         driver: the parameters, if they are not the usual ones.
     """
 
-    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID]  # noqa: RUF012 - the type the base declares
+    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID, keys.PROGRESS]  # noqa: RUF012 - the type the base declares
     out_keys = [keys.BACKGROUND]  # noqa: RUF012
 
     def __init__(self, env: DrivingEnv, driver: included.IDMPlanner | None = None) -> None:
@@ -76,20 +76,16 @@ class CarFollower(TensorDictModuleBase):
         agent = scenes.interactive[row[m], n]
         own, size = state[m, n], scenes.box_size[row[m], agent]
         line, speed = _Lines(*(r[row[m], n] for r in self.routes)), own[:, 3]
-        station = _own_station(line, own, self._driven(row[m], at[m], n, speed))
-        gap, other = self._leader(line, everyone, m, agent, own, size, station)
+        come = tensordict.get(keys.PROGRESS).flatten(0, lead - 1)[m, n]
+        station = _own_station(line, own, come)
+        hidden = ~everyone.others(scenes.interactive[row])[m, n]
+        gap, other = self._leader(line, everyone, m, hidden, own, size, station)
         red = self._red(line, row[m], at[m], station + 0.5 * size[:, 0], speed)
         gap, other = torch.minimum(gap, red), torch.where(red < gap, 0.0, other)
         pull = self._acceleration(speed, self._free_speed(line, station), gap, other)
         after = bicycle_step(own, pull, _steering(line, own, size[:, 0], station), size[:, 0], self.env.dt)
         moved = state.index_put((m, n), torch.where(drives[m, n, None], after, own))
         return tensordict.set(keys.BACKGROUND, moved.reshape(tensordict.get(keys.STATE).shape))
-
-    def _driven(self, row: Tensor, at: Tensor, n: Tensor, speed: Tensor) -> Float[Tensor, " P"]:
-        """Return about how far agents have come since they entered, by the mean of their speeds then and now."""
-        scenes, enter = self.env.scenes, self.env.scenes.enter[row, n]
-        before = scenes.log_state[row, enter, scenes.interactive[row, n], 3:].norm(dim=-1)
-        return (at - enter).clamp_min(0) * self.env.dt * 0.5 * (before + speed)
 
     def _acceleration(self, speed: Tensor, free: Tensor, gap: Tensor, other: Tensor) -> Float[Tensor, " P"]:
         driver = self.driver
@@ -107,15 +103,14 @@ class CarFollower(TensorDictModuleBase):
         return torch.where(ahead.any(-1), free, self.driver.speed)
 
     def _leader(
-        self, line: _Lines, now: Objects, m: Tensor, agent: Tensor, own: Tensor, size: Tensor, station: Tensor
+        self, line: _Lines, now: Objects, m: Tensor, hidden: Tensor, own: Tensor, size: Tensor, station: Tensor
     ) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
         """Return the gap to what is next in front, infinite for nothing, and its speed along the route."""
         delta = now.state[m, :, :2] - own[:, None, :2]
         squared = delta.square().sum(-1)
         # Behind is what is behind on any bend that a vehicle can take within its own length.
         behind = (delta * _unit(own[:, 2])[:, None]).sum(-1) < -size[:, :1]
-        other = torch.arange(squared.shape[1], device=m.device) != agent[:, None]
-        hidden = ~now.valid[m] | ~other | behind | (squared > included.VIEW**2)
+        hidden = hidden | behind | (squared > included.VIEW**2)
         chosen, there = (part[:, 0] for part in nearest(squared.masked_fill(hidden, torch.inf)[:, None], _LEADERS))
         pose, box = now.state[m[:, None], chosen], now.size[m[:, None], chosen]
         along, aside, way = _project(line, pose[..., :2], _within(line, station - size[:, 0], included.VIEW))
@@ -213,14 +208,14 @@ def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
     return out
 
 
-def _own_station(line: _Lines, own: Float[Tensor, "P 4"], driven: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
+def _own_station(line: _Lines, own: Float[Tensor, "P 4"], come: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
     """Return the metres along of agents that follow the lines: of the almost nearest places in their direction the
-    one that fits the distance driven best, as routes lead around blocks.
+    one nearest to where they have ``come``, as routes lead around blocks.
     """
     way = line.points.diff(dim=1)
     with_it = (way * _unit(own[:, 2])[:, None]).sum(-1) > _WITH * way.norm(dim=-1)
     with_it = with_it | ~with_it.any(-1, keepdim=True)
-    return _project(line, own[:, None, :2], with_it, driven)[0][:, 0]
+    return _project(line, own[:, None, :2], with_it, come)[0][:, 0]
 
 
 def _steering(line: _Lines, own: Tensor, length: Tensor, station: Tensor) -> Float[Tensor, " P"]:
