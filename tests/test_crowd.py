@@ -35,8 +35,7 @@ from symphony.saved.rollouts import world_of
 from symphony.saved.saving import save_simulation
 
 tiny = cache(lambda: make_agent(search={"branches": 4, "test_branches": 4}))
-DT = 0.2
-END = 200.0
+DT, END = 0.2, 200.0
 ALL = Crowd(128, everyone=True, open_traffic=True)
 
 
@@ -277,8 +276,7 @@ def test_the_baseline_is_the_planner_for_everyone(store):
 
 def test_a_goal_is_a_route_over_its_lane_or_past_its_point():
     segment = crossing(4, seed=1)
-    scenes = scene(segment, [0, 1], LaneGraph(segment.road))
-    name = segment.agent_id.tolist()
+    scenes, name = scene(segment, [0, 1], LaneGraph(segment.road)), segment.agent_id.tolist()
 
     def asked(*goals, **how):
         return given_goals(list(goals), [segment], scenes, **how)

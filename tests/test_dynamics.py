@@ -11,8 +11,7 @@ from symphony.envs import dynamics as module
 from symphony.envs.dynamics import Bicycle, Displacement, bicycle_step, displacement_step
 from symphony.geometry.frames import rotate, wrap
 
-DT = 0.2
-LENGTH = torch.tensor(4.6, dtype=torch.float64)
+DT, LENGTH = 0.2, torch.tensor(4.6, dtype=torch.float64)
 
 
 def states(count: int = 64, seed: int = 0) -> torch.Tensor:

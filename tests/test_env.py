@@ -160,8 +160,7 @@ def test_playback_follows_the_log_and_interactive_agents_do_not():
     env, brake = make_env(segment, config=ALL), torch.full((1, 50, 2), 10)
     out = run(env, env.start(torch.tensor([0])), brake)
     assert out[keys.STATE][0, -1, :, 3].max() == 0
-    other = out[keys.OBJECTS][0, -1, 0]
-    ego = out[keys.STATE][0, -1, 0]
+    other, ego = (out[key][0, -1, 0] for key in (keys.OBJECTS, keys.STATE))
     offset = torch.from_numpy(segment.position[2:, 50, :2]) - ego[:2]
     assert all((other[:, :2] * 20 - o).norm(dim=-1).min() < 1e-3 for o in offset)
 
@@ -289,8 +288,7 @@ def test_tables_follow_the_scenes():
 def test_copies_simulate_the_same(copied):
     env = make_env(config=EVERYTHING)
     start = env.start(torch.tensor([0, 1])).set(keys.ACTION, torch.full((2, 2), 80))
-    after = env.step(start.clone())["next"]
-    twin = copied(env)
+    after, twin = env.step(start.clone())["next"], copied(env)
     assert (twin.step(start.clone())["next"] == after).all()
     kept = [made._kept() for made in (env, twin)]
     assert kept[0] is not kept[1]

@@ -91,13 +91,6 @@ def zigzag() -> schema.RunSegment:
     return road().replace(road=make_road(lanes, successors=[(0, 0), (0, 1), (1, 0)], left=[(0, 0)], right=[(0, 1)]))
 
 
-def logged_twice() -> schema.RunSegment:
-    """Two agents that are one and the same in all but their id."""
-    base = road(num_agents=2)
-    same = {name: getattr(base, name)[[0, 0]] for name in ("position", "heading", "velocity", "size")}
-    return base.replace(**same)
-
-
 def tangle() -> schema.RunSegment:
     """Every lane leads to every other one."""
     pairs = [(a, b) for a in range(6) for b in range(6)]
@@ -127,7 +120,9 @@ SCENES: dict[str, Callable[[], schema.RunSegment]] = {
     "the shortest log": lambda: road(steps=2),
     "all standing": lambda: placed([(20, 0), (40, 0), (60, 3.5)], road()),
     "all in reverse": lambda: moving(-10.0),
-    "logged twice": logged_twice,
+    "logged twice": lambda: road(num_agents=2).replace(
+        **{name: getattr(road(num_agents=1), name)[[0, 0]] for name in ("position", "heading", "velocity", "size")}
+    ),
     "the highest speed": lambda: moving(schema.MAX_SPEED - 1, dt=0.05),
     "the largest jumps": jumping,
     "the shortest time step": lambda: moving(10.0, dt=schema.MIN_DT),
@@ -274,8 +269,7 @@ def test_segment_and_step_are_those_where_it_began(store, search, rule, value, b
 def test_what_comes_after_the_end_of_a_segment_is_none_of_its_business(store: SegmentStore) -> None:
     """Else a short segment could be refused beside a longer one, and be fine alone."""
     good, config = make_agent(), EvaluateConfig(rollouts=2, search="tree")
-    usual = evaluate(good, store, config).metrics.rows()
-    last = LENGTHS[1] - 1
+    usual, last = evaluate(good, store, config).metrics.rows(), LENGTHS[1] - 1
     broken = replace(
         good,
         policy=Spoiled(good.policy, keys.LOGITS, 1, last),

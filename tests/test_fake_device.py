@@ -17,12 +17,15 @@ from helpers_losses import CASES, LOGGED, ROWS, SCENES, batch_of, losses, search
 from helpers_processes import forget, output_of
 from helpers_segments import crossing, straight_road
 from symphony import keys, objectives
+from symphony.agents import load_agent
 from symphony.collectors import Systematic
+from symphony.config import EvaluateConfig
 from symphony.envs import Bicycle, DrivingEnv, ObservationConfig, collate, scene
 from symphony.envs.scene import map_edge
 from symphony.modules import SeededNoise
 from symphony.roadgraph import LaneGraph
 from symphony.rollouts.background import CarFollower
+from symphony.rollouts.driving import simulation
 from symphony.rollouts.unroll import simulate, start_states
 
 MANY, NOTHING = ObservationConfig(16, 4000), ObservationConfig.nothing()
@@ -115,6 +118,10 @@ def test_others_that_a_rule_drives_stay_on_the_device():
         follow.routes = type(follow.routes)(*(on(device, part) for part in follow.routes))
         number = torch.arange(2, device=device.device)
         assert follow(env.start(number, number))[keys.BACKGROUND].device.type == NAME
+        # Goals that are given come from the host; it ends where the time step is looked at.
+        with pytest.raises(DataDependentOutputException):
+            simulation(load_agent("idm"), env.scenes, EvaluateConfig(), given=torch.zeros(2, 2).long())
+        device.waits.clear()
 
 
 def test_searches_stay_on_the_device():

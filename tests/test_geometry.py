@@ -14,9 +14,7 @@ from hypothesis import strategies as st
 from symphony import geometry
 from symphony.geometry.frames import forward_speed, with_speed
 
-coordinate = st.floats(-6, 6)
-angle = st.floats(-7, 7)
-side = st.floats(0.1, 6)
+coordinate, angle, side = (st.floats(*ends) for ends in ((-6, 6), (-7, 7), (0.1, 6)))
 box = st.tuples(coordinate, coordinate, angle, side, side)
 
 

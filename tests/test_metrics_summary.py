@@ -248,8 +248,7 @@ def test_histogram_bins() -> None:
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1))
 def test_divergence_agrees_with_scipy(seed: int, share: float) -> None:
-    distance = pytest.importorskip("scipy.spatial.distance")
-    rng = np.random.default_rng(seed)
+    distance, rng = pytest.importorskip("scipy.spatial.distance"), np.random.default_rng(seed)
     p, q = (rng.integers(0, 9, 201) * (rng.random(201) < share) for _ in range(2))
     p[seed % 201] += 1
     q[(seed // 7) % 201] += 1
@@ -259,8 +258,7 @@ def test_divergence_agrees_with_scipy(seed: int, share: float) -> None:
 
 
 STEPS, DT = 60, 0.2
-TIME = torch.arange(STEPS) * DT
-EVERY = torch.ones(STEPS, dtype=torch.bool)
+TIME, EVERY = torch.arange(STEPS) * DT, torch.ones(STEPS, dtype=torch.bool)
 
 
 def along_x(arrival: float, speed: float = 10.0) -> torch.Tensor:

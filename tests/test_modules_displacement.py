@@ -92,8 +92,7 @@ def test_a_draw_inverts_the_cumulative_distribution():
 @pytest.mark.parametrize("noise", [0.0, 2.0**-24, 0.5, 1 - 2.0**-24, 1.0])
 def test_impossible_categories_are_never_drawn(noise):
     torch.manual_seed(0)
-    logits = torch.randn(2000, 12)
-    allowed = torch.rand(2000, 12) < 0.4
+    logits, allowed = torch.randn(2000, 12), torch.rand(2000, 12) < 0.4
     allowed[:, 5] = True
     drawn = inverse_cdf(logits.masked_fill(~allowed, -torch.inf), torch.full((2000,), noise))
     assert allowed.gather(1, drawn[:, None]).all()

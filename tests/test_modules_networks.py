@@ -21,8 +21,7 @@ from symphony.streams import uniform
 def make(n=7, count=60, features=5, hidden=16, share=0.6, dtype=torch.float64, seed=0):
     torch.manual_seed(seed)
     network = modules.mlp((features, hidden, hidden)).to(dtype)
-    elements = torch.randn(n, count, features, dtype=dtype)
-    mask = torch.rand(n, count) < share
+    elements, mask = torch.randn(n, count, features, dtype=dtype), torch.rand(n, count) < share
     mask[0] = False
     mask[1] = True
     return network, elements, mask
@@ -94,8 +93,7 @@ def test_masked_elements_have_no_influence_whatever_they_hold(mode):
 @settings(max_examples=25, deadline=None)
 def test_order_and_padding_of_the_elements_change_nothing(seed, extra):
     network, elements, mask = make(n=3, count=55, seed=seed)
-    base = results(network, elements, mask, "winner")
-    order = torch.randperm(elements.shape[1])
+    base, order = results(network, elements, mask, "winner"), torch.randperm(elements.shape[1])
     shuffled = results(network, elements[:, order], mask[:, order], "winner")
     shuffled[1] = shuffled[1][:, order.argsort()]
     padding = torch.full((3, extra, elements.shape[2]), 1e6, dtype=elements.dtype)
@@ -110,8 +108,7 @@ def test_order_and_padding_of_the_elements_change_nothing(seed, extra):
 @pytest.mark.parametrize("mode", ["dense", "winner"])
 def test_among_equal_elements_the_first_gets_the_gradient(mode):
     network, elements, _ = make(n=2, dtype=torch.float32)
-    same = elements[:1, :1].expand(1, 60, -1).clone()
-    mask = torch.ones(1, 60, dtype=torch.bool)
+    same, mask = elements[:1, :1].expand(1, 60, -1).clone(), torch.ones(1, 60, dtype=torch.bool)
     mask[:, :2] = False
     gradient = results(network, same, mask, mode)[1]
     assert gradient[0, 2].any()

@@ -249,8 +249,7 @@ def test_who_drives_around_a_block_gets_on(radius, speed, start, seed, hidden):
     arc = np.linalg.norm(np.diff(line, axis=0), axis=-1).sum()
     true = np.minimum(start + speed * 0.2 * np.arange(51), arc)
     rng = np.random.default_rng(seed)
-    path = along(line, true)[0] + rng.uniform(-0.3, 0.3, (51, 2))
-    valid = np.ones(51, bool)
+    path, valid = along(line, true)[0] + rng.uniform(-0.3, 0.3, (51, 2)), np.ones(51, bool)
     if hidden:
         valid[[0, 7, 8, 30]] = False
         path[~valid] = np.nan

@@ -90,7 +90,8 @@ def simulation(
             another rule drives the others than the agent.
         NotFiniteError: if one of its networks puts out a number that is not finite.
     """
-    _check_given(agent, scenes, config, given)
+    _check_given(agent, config, given)
+    given = None if given is None else given.to(scenes.route_logged.device)
     scenes, config = _ruled(agent, scenes, config, given) if agent.rule else (scenes, config)
     # Beside log playback there are only planners: any policy will do, as its actions are not used.
     policy = ConstantVelocity(Bicycle()) if agent.policy is None else agent.policy
@@ -195,7 +196,7 @@ def simulate_batch(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, **h
         found = simulation(agent, scenes, config, **how)
         between = between_states(scenes, found.rollouts.state, existing(scenes, found.rollouts))
         return found._replace(rollouts=found.rollouts._replace(collision=between))
-    _check_given(agent, scenes, config, how.get("given"))
+    _check_given(agent, config, how.get("given"))
     log = playback(scenes)
     at_states = _logged_collisions(scenes, at_states=True)[:, None, 1:]
     return Simulation(log, torch.full_like(log.state[:, :, 0, :, 0], -1, dtype=torch.int64), None, at_states)
@@ -214,13 +215,10 @@ def _ruled(
     return ruled, dataclasses.replace(config, others=agent.rule or config.others)
 
 
-def _check_given(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, given: Int[Tensor, "B N"] | None) -> None:
+def _check_given(agent: Agent, config: EvaluateConfig, given: Int[Tensor, "B N"] | None) -> None:
     if config.pace and agent.spec is None:
         raise ConfigError(f"{agent.name} is no learned agent, so a pace has no effect")
-    if given is None or agent.goals is not None or agent.rule:
-        return
-    follows = scenes.background & (config.others == "idm")
-    if bool(((given.to(follows.device) >= 0) & ~follows).any()):
+    if given is not None and agent.goals is None and not agent.rule and bool((given >= 0).any()):
         raise ConfigError(f"{agent.name} follows no goals, so a given one has no effect")
 
 
@@ -231,10 +229,10 @@ def _fixed(
     which are planned, and background agents, if asked for, those of the log, others those that are given.
     """
     followed = scenes.route_logged[row]
+    if given is not None:
+        goal = torch.where(given[row] >= 0, given[row], goal)
     if along_log:
         goal = torch.where(scenes.background[row], followed, goal)
-    if given is not None:
-        goal = torch.where(given.to(goal.device)[row] >= 0, given.to(goal.device)[row], goal)
     # Scenes without routes have no number of one either.
     along = planned * bool(scenes.route_point.shape[1])
     return torch.cat([followed[..., :along], goal[..., along:]], -1)

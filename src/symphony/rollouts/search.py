@@ -85,8 +85,8 @@ def no_value(state: TensorDictBase) -> Float[Tensor, "*b"]:
 
 
 def rule_score(env: DrivingEnv, state: TensorDictBase) -> Float[Tensor, "*b N"]:
-    """Return the score [..., N] of a rule: 1 where an agent collides, is off the road, or would collide within
-    :data:`AHEAD`, observed or not, if all kept speed and course.
+    """Return the score [..., N] of a rule: 1 where an agent collides, is off the road, or would :data:`AHEAD`
+    later, observed or not, if all kept speed and course.
     """
     there, row = state.get(keys.VALID), state.get(keys.SCENE).flatten()
     moves, real = (state.get(key).flatten(0, state.ndim - 1) for key in (keys.STATE, keys.VALID))
