@@ -56,7 +56,7 @@ class CarFollower(TensorDictModuleBase):
         driver: the parameters, if they are not the usual ones.
     """
 
-    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID, keys.PROGRESS]  # noqa: RUF012 - the type the base declares
+    in_keys = [keys.SCENE, keys.STEP, keys.STATE, keys.VALID, keys.PROGRESS]  # noqa: RUF012
     out_keys = [keys.BACKGROUND]  # noqa: RUF012
 
     def __init__(self, env: DrivingEnv, driver: included.IDMPlanner | None = None) -> None:
