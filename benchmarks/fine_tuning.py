@@ -1,6 +1,6 @@
 """Fine-tune an agent in closed loop in one of several ways, to compare them at equal updates.
 
-    python benchmarks/fine_tuning.py {cloning,siblings,nearest,both,gradient} --warm-start RUN --data DIR --out DIR
+    python benchmarks/fine_tuning.py {cloning,siblings,...,fault} --warm-start RUN --data DIR --out DIR
     python benchmarks/fine_tuning.py table RUNS         # of runs RUNS/WAY-SEED, evaluated on both test parts
 
 - `cloning`: the log alone, as before.
@@ -10,6 +10,7 @@
   way back to the log (as CAT-K of Zhang et al., "Closed-loop supervised fine-tuning of tokenized traffic models").
 - `both`: half of the states from each of these.
 - `gradient`: the policy gradient of recipe `bc_rl`.
+- `fault`: the same, in which being hit from behind, which playback vehicles can't help, costs nothing.
 
 It takes the options of `symphony train bc_rl`; all ways also learn from the log in every update.
 """
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,7 @@ from symphony.learning import SceneDataset, SearchReplay, with_survivors
 from symphony.learning.experts import logged
 from symphony.learning.perturbation import way_back
 from symphony.metrics.intervals import clustered_mean
+from symphony.metrics.kinds import CollisionKind, collision_kinds
 from symphony.modules import SeededNoise
 from symphony.recipes import train
 from symphony.rollouts.search import branched_streams, collector_settings, realism_score
@@ -121,11 +124,38 @@ def relabelled(replay: SearchReplay, count: int, rng: torch.Generator, observati
     return batch.set(keys.WEIGHT, both.float())
 
 
+def at_fault(replay: SearchReplay, count: int, rng: torch.Generator, observation: Any) -> TensorDict:
+    """Return steps [count] for the policy gradient; an agent that is hit from behind is gone from then on instead."""
+    leaves, scenes = replay.leaves.copy(), replay.env.scenes
+    scenes = scenes[leaves[:, 0, 0][keys.SCENE].squeeze(-1)]
+    going = leaves[keys.STEP] < scenes.last_step[:, None, None, None]
+    there = leaves[keys.VALID] & going
+    collided, times = leaves["next", *keys.COLLISION], torch.arange(leaves.shape[2])
+    state = torch.cat([leaves[keys.STATE], leaves["next", *keys.STATE][:, :, -1:]], 2)  # [B, S, T+1, N, 4]
+    found = collision_kinds(
+        (collided.squeeze(-1) & there).transpose(2, 3),
+        state.transpose(2, 3),
+        torch.cat([there, there[:, :, -1:]], 2).transpose(2, 3),
+        torch.where(scenes.interactive_valid, scenes.interactive, -1)[:, None],
+        scenes.log_state[:, None, : len(times) + 1].transpose(2, 3),
+        scenes.log_valid[:, None, : len(times) + 1].transpose(2, 3),
+        scenes.box_size[:, None],
+        scenes.agent_type[:, None],
+    )
+    hit = (found.kind == CollisionKind.REAR_ENDED)[:, :, None]  # [B, S, 1, N]
+    leaves.set(keys.VALID, leaves[keys.VALID] & ~(hit & (times[:, None] > found.step[:, :, None])))
+    leaves.set(("next", *keys.COLLISION), collided & ~hit[..., None])
+    judged = copy(replay)
+    judged._leaves = leaves
+    return judged.blamed(count, rng, observation)
+
+
 TITLES = {
     "siblings": "survivors of a search against pruned siblings",
     "nearest": "rollouts near the log with the way back (CAT-K)",
     "both": "half of each",
     "gradient": "the policy gradient",
+    "fault": "the same, being hit from behind costs nothing",
 }
 Drawn = Callable[[SearchReplay, int, torch.Generator, Any], TensorDict]
 WAYS: dict[str, tuple[Drawn, ...]] = {
@@ -134,6 +164,7 @@ WAYS: dict[str, tuple[Drawn, ...]] = {
     "nearest": (relabelled,),
     "both": (siblings, relabelled),
     "gradient": (SearchReplay.blamed,),
+    "fault": (at_fault,),
 }
 
 
@@ -199,17 +230,20 @@ def table(runs: Path) -> None:
     rows, seeds = [], []
     for way, title in TITLES.items():
         cells: list[Any] = [title]
-        for part, names in (("test", ("collision_rate", "offroad_time")), ("ngsim-test", ("collision_rate",))):
+        for part, shown in (("test", 3), ("ngsim-test", 2)):
             if lost := [each for each in (way, "cloning") if (each, part) not in found]:
                 raise ConfigError(f"{runs}: no run of {lost[0]} has an evaluation on {part}")
             mine = found[way, part]
             base = [entry for entry in found["cloning", part] if entry.seed in {each.seed for each in mine}]
+            names = ("collision_rate", "collision_rear_ended", "offroad_time")
             member, (after, before) = segment_rows([mine, base], names)
-            both = zip(after, before, strict=True)
-            cells += [[round(float(x), 1) for x in clustered_mean(a - b, member)] for a, b in both]
+            every, behind, off = after - before
+            changes = [every, every - behind, off][:shown]
+            cells += [[round(float(x), 1) for x in clustered_mean(change, member)] for change in changes]
         rows.append(cells)
         seeds.append(f"{title}: {len(mine)}")
-    columns = [[""], *([name, 1] for name in ("towns: collisions", "towns: off-road", "real roads: collisions"))]
+    towns, roads = ([f"{part}: collisions", f"{part}: not from behind"] for part in ("towns", "real roads"))
+    columns = [[""], *([name, 1] for name in (*towns, "towns: off-road", *roads))]
     of = f"points that 500 updates give beyond cloning (seeds of {', '.join(seeds)}), paired, ± over recordings"
     write("fine-tuning", of, columns, rows, "fine_tuning.py table RUNS")
 

@@ -22,13 +22,14 @@ from symphony.config import Method
 from symphony.evaluation.table import BASELINES, COLUMNS, collect, compare, method_name, paper_figures
 
 RECORDS = Path(__file__).resolve().parents[1] / "results"
-TOWNS, ROADS = ("collision_rate", "offroad_time", "ade", "min_sade"), ("collision_rate", "ade", "min_sade")
+HIT = "collision_rear_ended"
+TOWNS, ROADS = ("collision_rate", HIT, "offroad_time", "ade", "min_sade"), ("collision_rate", "ade", "min_sade")
 PAPER = ("collision_rate", "ade")
 
 
 def digits(key: str) -> int:
     """Return how many digits after the point a number is worth."""
-    return 1 if key == "collision_rate" else COLUMNS[key].digits
+    return 1 if key in ("collision_rate", HIT) else COLUMNS[key].digits
 
 
 def numbers(records: Sequence[Any], keys: Sequence[str]) -> list[list[float]]:
@@ -81,7 +82,8 @@ def main(args: Sequence[str] | None = None) -> None:
             own = map(numbers, records, (TOWNS, ROADS))
             rows.append([method_name(method) + way, *(cell for cells in own for cell in cells), *theirs])
     heads = [("towns", TOWNS), ("real roads", ROADS), ("paper", PAPER)]
-    shown = {"collision_rate": "collisions %", "offroad_time": "off-road %", "ade": "ADE m", "min_sade": "minSADE m"}
+    shown = {"collision_rate": "collisions %", HIT: "hit from behind %", "offroad_time": "off-road %"}
+    shown |= {"ade": "ADE m", "min_sade": "minSADE m"}
     columns = [
         [f"{head}: {shown[key]}", 2 if head == "paper" else digits(key)] for head, keys in heads for key in keys
     ]

@@ -102,6 +102,7 @@ _ROW = (
     "min_sade",
     "collision_rate_at_states",
     "collision_with_playback",
+    "collision_rear_ended",
     "standing",
     "standing_log",
 )
