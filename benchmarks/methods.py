@@ -24,7 +24,7 @@ from symphony.evaluation.table import BASELINES, COLUMNS, collect, compare, meth
 RECORDS = Path(__file__).resolve().parents[1] / "results"
 HIT = "collision_rear_ended"
 TOWNS, ROADS = ("collision_rate", HIT, "offroad_time", "ade", "min_sade"), ("collision_rate", "ade", "min_sade")
-PAPER = ("collision_rate", "ade")
+PAPER = ("collision_rate",)
 
 
 def digits(key: str) -> int:
