@@ -151,8 +151,8 @@ def at_fault(replay: SearchReplay, count: int, rng: torch.Generator, observation
 
 
 TITLES = {
-    "siblings": "survivors of a search against pruned siblings",
-    "nearest": "rollouts near the log with the way back (CAT-K)",
+    "siblings": "survivors against pruned siblings",
+    "nearest": "the way back to the log (CAT-K)",
     "both": "half of each",
     "gradient": "the policy gradient",
     "fault": "the same, being hit from behind costs nothing",
