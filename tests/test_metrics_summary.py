@@ -86,14 +86,14 @@ def test_distances_and_the_divergence_by_hand() -> None:
     inputs |= {"segment_ids": ["a", "b"], "displacement": displacement}
     inputs["logged"] = torch.tensor([[[True, True], [True, True]], [[True, True], [True, False]]])
     inputs["curvature"] = [np.array([0.1, 0.1]), np.array([0.1, -0.2])]
-    inputs["curvature_log"] = [np.array([0.1]), np.array([-0.2])]
-    metrics = scored(inputs)
+    metrics = scored(inputs | {"curvature_log": [np.array([0.1]), np.array([-0.2])]})
     numbers, (first, second) = metrics.compute(), metrics.rows()
+    assert numbers["collision_rear_ended"] == np.mean([row["collision_rear_ended"] for row in (first, second)])
     assert numbers["ade"] == pytest.approx(((12 + 10) / 2 + (12 + 3) / 2) / 7)
     assert numbers["min_sade"] == pytest.approx((10 + 3) / 7)
     assert (first["ade"], first["min_sade"]) == (pytest.approx(11 / 4), pytest.approx(10 / 4))
     assert (second["ade"], second["min_sade"]) == (pytest.approx(7.5 / 3), pytest.approx(1))
-    p, q, m = np.array([0.25, 0.75]), np.array([0.5, 0.5]), np.array([0.375, 0.625])
+    p, q, m = (np.array(share) for share in ([0.25, 0.75], [0.5, 0.5], [0.375, 0.625]))
     divergence = ((p * np.log(p / m)).sum() + (q * np.log(q / m)).sum()) / 2
     assert numbers["curvature_jsd"] == pytest.approx(divergence)
 
