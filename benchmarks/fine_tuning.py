@@ -135,7 +135,7 @@ def at_fault(replay: SearchReplay, count: int, rng: torch.Generator, observation
     found = collision_kinds(
         (collided.squeeze(-1) & there).transpose(2, 3),
         state.transpose(2, 3),
-        torch.cat([there, there[:, :, -1:]], 2).transpose(2, 3),
+        torch.cat([leaves[keys.VALID], leaves["next", *keys.VALID][:, :, -1:]], 2).transpose(2, 3),
         torch.where(scenes.interactive_valid, scenes.interactive, -1)[:, None],
         scenes.log_state[:, None, : len(times) + 1].transpose(2, 3),
         scenes.log_valid[:, None, : len(times) + 1].transpose(2, 3),

@@ -9,14 +9,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
-from helpers_segments import crossing, straight_road
+from helpers_segments import LANE_WIDTH, crossing, make_segment, straight_road
 from helpers_store import brief, fill
+from symphony import DrivingEnv, ObservationConfig, keys
 from symphony.agents import load_agent
 from symphony.agents.checkpoint import save_checkpoint
 from symphony.agents.choice import FOLDER as PRETRAINED
+from symphony.envs import Bicycle, ConstantVelocity, scene
+from symphony.learning import SearchReplay
 from symphony.modules import mlp, pool_elements
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -120,6 +124,33 @@ def test_reinforcement_learning_is_recorded(program: Any, tmp_path: Path, monkey
     assert (tmp_path / "a.png").stat().st_size > 5000
     record = learning.record(runs)
     assert [len(row) for row in record["rows"]] == [len(record["columns"])] * 4
+
+
+def test_being_hit_from_behind_costs_nothing(program: Any, monkeypatch: Any) -> None:
+    """By a car of the log; what a car runs into does, and so does whom two meet in the last step."""
+    x, speed = np.array([60, 40, 40, 60, 0, 42]), np.array([0, 10, 10, 0, 10, -10])
+    lane, moved = LANE_WIDTH * np.array([0, 0, 2, 2, 1, 1]), x[:, None] + speed[:, None] * np.arange(12) * 0.2
+    pose, across = np.stack([moved, np.repeat(lane, 12).reshape(6, 12)], -1), np.zeros_like(moved)
+    heading, along = across + np.pi * (speed < 0)[:, None], np.stack([across + speed[:, None], across], -1)
+    made = make_segment(straight_road().road, pose, heading, along)
+    scenes = scene(made, [0, 2, 4, 5])
+    scenes.last_step[:] = 10
+    env = DrivingEnv(scenes, Bicycle(), ObservationConfig.nothing())
+    start, ahead = env.start(torch.tensor([0])), ConstantVelocity(env.dynamics, env.dt)
+    driven = env.rollout(10, ahead, auto_reset=False, tensordict=start)
+    after = driven["next"].select(keys.STEP, keys.VALID, keys.STATE)[:, -1:]
+    beyond = driven[:, -1:].clone().update(after)  # as searches go on, which counts for nothing
+    driven = torch.cat([driven, beyond], 1)
+    replay = SearchReplay.__new__(SearchReplay)
+    replay.env, replay._leaves = env, driven[:, None]
+    monkeypatch.setattr(SearchReplay, "blamed", lambda self, *_: self.leaves)
+    judged = program("fine_tuning").at_fault(replay, 1, torch.Generator(), env.observation)
+    hit, before = (each["next", keys.COLLISION][0, 0, ..., 0] for each in (judged, replay.leaves))
+    first = before.int().argmax(0).tolist()
+    assert first == [7, 7, 9, 9]
+    assert torch.equal(hit, before & torch.tensor([False, True, True, True]))
+    gone = ~judged[keys.VALID][0, 0]
+    assert torch.equal(gone, (torch.arange(11) > 7)[:, None] & torch.tensor([True, False, False, False]))
 
 
 def test_planners_are_recorded(program: Any, tmp_path: Path, monkeypatch: Any) -> None:

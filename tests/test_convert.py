@@ -192,6 +192,10 @@ def test_a_merge_that_was_killed_is_begun_anew(tmp_path: Path) -> None:
             merge(PARTS[1:], tmp_path / "all")
     assert merge(PARTS[1:], tmp_path / "all").checksum() == SegmentStore(PARTS[1]).checksum()
     assert not (tmp_path / "all.merging").exists()
+    own = merge(PARTS[1:], tmp_path / "more.merging").path
+    with pytest.raises(DataError, match="is a store, in the way"):
+        merge(PARTS[1:], tmp_path / "more")
+    assert SegmentStore(own).checksum() == SegmentStore(PARTS[1]).checksum()
 
 
 def test_a_conversion_to_the_same_name_is_left_alone(logs: Write, tmp_path: Path) -> None:

@@ -62,9 +62,11 @@ def refused(capsys):
     return check
 
 
-def test_scores_of_scenarios(tmp_path, monkeypatch):
+def test_scores_of_scenarios(tmp_path, monkeypatch, capsys):
     many, out, again, ahead = written(tmp_path, *NAMES, "dddd"), tmp_path / "a.json", tmp_path / "b.json", []
     more = ("--config", "2024", "--per-object")
+    assert run(*many, *more) == 1
+    assert "--per-object adds to the JSON" in capsys.readouterr().err
     assert run(*many, "--json", out, *more) == 0
     found = json.loads(out.read_text())
     assert (found["config"], found["scenario_count"]) == ("2024", 4)

@@ -45,6 +45,8 @@ class Score(shared.Command):
     def __call__(self) -> None:
         from symphony.data.report import left_out
 
+        if self.per_object and self.json is None:
+            raise errors.ConfigError("--per-object adds to the JSON: name its file with --json")
         options = {key: value for key, value in vars(self).items() if key not in ("scenario", "json")}
         with shared.progress("scoring", "scenarios") as advance:
             found, skipped = wosac.score_files(self.scenario, **options, progress=advance)

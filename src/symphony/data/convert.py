@@ -447,6 +447,8 @@ def merge(paths: Sequence[Path], out: Path, progress: Told | None = None) -> Seg
     if read_job(folder_of(out)) is not None:
         raise DataError(f"an unfinished conversion to that name lies in {folder_of(out)}", file=out)
     draft = out.with_name(f"{out.name}.merging")
+    if (draft / store_format.REPORT).is_file():  # which a merge writes last
+        raise DataError("is a store, in the way of what is merged; move it", file=draft)
     if (draft / store_format.HEADER).is_file():  # of a merge that was killed, or goes on, which is told
         with store_format.lock(draft):
             shutil.rmtree(draft)
