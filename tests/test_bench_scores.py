@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from helpers_saved import played
 from helpers_segments import crossing, hide, make_segment, straight_road
@@ -25,8 +24,6 @@ from symphony.data.store import SegmentStore
 from symphony.evaluation.report import Report, add_segment
 from symphony.files import finite
 from symphony.saved.folder import About, save_rollouts
-
-Reals = NDArray[np.float64]
 
 
 @given(st.sampled_from([0.1, 0.2]), st.integers(4, 60), st.sampled_from([1, 2]))

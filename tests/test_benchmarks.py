@@ -50,35 +50,6 @@ def test_all_agents_of_a_ring_step_and_segments_are_prepared(program: Any) -> No
     assert after["state"].isfinite().all()
 
 
-def row(seconds: float, **changes: Any) -> dict[str, Any]:
-    numbers = {"operators": 12, "flops": 0, "faults": 34, "mebibytes": 5.6, "matmul": 2e9, "parts": {}}
-    timed = {"units": 100, "unit": "agent-steps", "seconds": seconds, "quartiles": [seconds, 2 * seconds]}
-    return {"tuned": True, **numbers, **timed, **changes}
-
-
-def test_tables_hold_the_ratios(program: Any) -> None:
-    rows = {
-        "simulator": [row(0.5, tuned=False), row(0.25, parts={"dynamics": 0.75, "the rest": 0.25})],
-        "update": [row(2.0, units=1, unit="updates", flops=10**9, dense=3 * 10**9)],
-        "brute force": [row(1.0)], "points P = 16": [row(0.001)], "points P = 64": [row(0.002)],
-    }  # fmt: skip
-    machine = {"processor": "one", "cores": 2, "python": "3", "torch": "2", "symphony": "1"}
-    report = {"date": "2000-01-01", "minutes": 1.0, "machine": machine, "rows": rows}
-    report["start"] = {"a": 2.0, "b": 3.0}
-    before = {"rows": {"simulator": [row(1.0, matmul=4e9)]}}
-    text = program("tables").text(report, before)
-    lines = [line.split("|")[1:-1] for line in text.splitlines() if line[:1] == "|"]
-    cells = [[cell.strip() for cell in line] for line in lines]
-    found = {(line[0], line[1]): line for line in cells}
-    # Twice the speed of the plain simulator as it comes, four times with memory kept: eight times what it was.
-    assert [found["simulator", how][5] for how in ("as it comes", "kept")] == ["2.00", "4.00"]
-    assert found["simulator", "kept"][-1] == "8.00"
-    assert found["update", "kept"][3:8] == ["2,000", "50 %", "", "25 %", "75 %"]
-    assert ["simulator", "dynamics 75 %, the rest 25 %"] in cells
-    assert ["points P", "16: 1 ms, 6 MiB; 64: 2 ms, 6 MiB"] in cells
-    assert ["b", "3.0", "1.50"] in cells
-
-
 def test_dense_counts_the_operations_of_every_element(program: Any) -> None:
     measure, encoder = program("measure"), mlp((3, 4, 5))
     sets, mask, found = torch.rand(2, 100, 3), torch.ones(2, 100).bool(), {}
@@ -128,29 +99,24 @@ def test_reinforcement_learning_is_recorded(program: Any, tmp_path: Path, monkey
 
 def test_being_hit_from_behind_costs_nothing(program: Any, monkeypatch: Any) -> None:
     """By a car of the log; what a car runs into does, and so does whom two meet in the last step."""
-    x, speed = np.array([60, 40, 40, 60, 0, 42]), np.array([0, 10, 10, 0, 10, -10])
-    lane, moved = LANE_WIDTH * np.array([0, 0, 2, 2, 1, 1]), x[:, None] + speed[:, None] * np.arange(12) * 0.2
-    pose, across = np.stack([moved, np.repeat(lane, 12).reshape(6, 12)], -1), np.zeros_like(moved)
-    heading, along = across + np.pi * (speed < 0)[:, None], np.stack([across + speed[:, None], across], -1)
-    made = make_segment(straight_road().road, pose, heading, along)
-    scenes = scene(made, [0, 2, 4, 5])
+    x, speed, lane = np.array([[60, 40, 40, 60, 0, 42], [0, 10, 10, 0, 10, -10], [0, 0, 2, 2, 1, 1]])[..., None]
+    place = np.stack([x + speed * np.arange(12) * 0.2, np.repeat(LANE_WIDTH * lane, 12, 1)], -1)
+    heading = np.pi * (speed < 0) + np.zeros((6, 12))
+    scenes = scene(make_segment(straight_road().road, place, heading, np.gradient(place, 0.2, axis=1)), [0, 2, 4, 5])
     scenes.last_step[:] = 10
     env = DrivingEnv(scenes, Bicycle(), ObservationConfig.nothing())
     start, ahead = env.start(torch.tensor([0])), ConstantVelocity(env.dynamics, env.dt)
     driven = env.rollout(10, ahead, auto_reset=False, tensordict=start)
     after = driven["next"].select(keys.STEP, keys.VALID, keys.STATE)[:, -1:]
-    beyond = driven[:, -1:].clone().update(after)  # as searches go on, which counts for nothing
-    driven = torch.cat([driven, beyond], 1)
-    replay = SearchReplay.__new__(SearchReplay)
-    replay.env, replay._leaves = env, driven[:, None]
+    replay = SearchReplay.__new__(SearchReplay)  # searches go on beyond the end, which counts for nothing
+    replay.env, replay._leaves = env, torch.cat([driven, driven[:, -1:].clone().update(after)], 1)[:, None]
     monkeypatch.setattr(SearchReplay, "blamed", lambda self, *_: self.leaves)
     judged = program("fine_tuning").at_fault(replay, 1, torch.Generator(), env.observation)
     hit, before = (each["next", keys.COLLISION][0, 0, ..., 0] for each in (judged, replay.leaves))
-    first = before.int().argmax(0).tolist()
-    assert first == [7, 7, 9, 9]
+    assert before.int().argmax(0).tolist() == [7, 7, 9, 9]
     assert torch.equal(hit, before & torch.tensor([False, True, True, True]))
-    gone = ~judged[keys.VALID][0, 0]
-    assert torch.equal(gone, (torch.arange(11) > 7)[:, None] & torch.tensor([True, False, False, False]))
+    gone = (torch.arange(11) > 7)[:, None] & torch.tensor([True, False, False, False])
+    assert torch.equal(~judged[keys.VALID][0, 0], gone)
 
 
 def test_planners_are_recorded(program: Any, tmp_path: Path, monkeypatch: Any) -> None:

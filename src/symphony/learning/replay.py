@@ -99,15 +99,8 @@ class SearchReplay:
         return self._leaves
 
     def survivors(self, count: int, rng: torch.Generator, observation: ObservationConfig) -> TensorDict:
-        """Return states of surviving rollouts and their actions, drawn uniformly from all before the scenes' ends.
-
-        Args:
-            count: K.
-            rng: the generator of the draw.
-            observation: what the policy observes.
-
-        Returns:
-            TensorDict [K, N]: observation, ``ACTION``, ``ROLLOUT`` (True).
+        """Return K states of surviving rollouts, drawn uniformly from all before the scenes' ends, as the policy
+        observes them, and their actions: a TensorDict [K, N] of the observation, ``ACTION``, ``ROLLOUT`` (True).
         """
         return self.learned(_drawn(self.env, self.leaves, count, rng), observation)
 
@@ -118,16 +111,8 @@ class SearchReplay:
         return batch.set(keys.ROLLOUT, torch.ones_like(batch.get(keys.VALID)))
 
     def blamed(self, count: int, rng: torch.Generator, observation: ObservationConfig) -> TensorDict:
-        """Return states of rollouts and their actions, drawn as often as they matter, with weights for a policy
-        gradient: of a search that keeps all branches.
-
-        Args:
-            count: K.
-            rng: the generator of the draw.
-            observation: what the policy observes.
-
-        Returns:
-            TensorDict [K, N]: observation, ``ACTION``, ``ROLLOUT`` (True), ``WEIGHT`` (see :func:`advantages`).
+        """Return K states of rollouts of a search that keeps all branches, drawn as often as they matter, as
+        :meth:`survivors` does, with the ``WEIGHT`` [K, N] of their actions in a policy gradient (:func:`advantages`).
         """
         found = advantages(self.env, self.leaves)
         share = found.abs().amax(-1).flatten().clamp_min(1e-9)
@@ -137,15 +122,10 @@ class SearchReplay:
         return self.learned(self.leaves.flatten()[pick], observation).set(keys.WEIGHT, PRICE * weight)
 
     def both_kinds(self, rng: torch.Generator) -> TensorDict:
-        """Return simulated states, pruned ones included, and logged states of the same scenes.
+        """Return K simulated states, pruned ones included, and K logged ones of the same scenes, drawn by ``rng``: a
+        TensorDict [2 K, N] of the observation and ``SIMULATED``.
 
         The log is fitted to the action space, lest its noise give it away; its agents follow the routes they took.
-
-        Args:
-            rng: the generator of the draw.
-
-        Returns:
-            TensorDict [2 K, N]: observation and ``SIMULATED``.
         """
         fake = _after(_drawn(self.env, self.leaves.get("tree"), self.states, rng))
         real = self._logged(self.states, rng)
