@@ -192,11 +192,11 @@ def test_damage_is_found_and_named(tmp_path):
 
 
 @pytest.mark.parametrize(("file", "change", "message"), [
-    ("index.jsonl", {"file": ["segments/a"]}, "line 1 is damaged .file must be str"),
+    ("index.jsonl", {"file": [""]}, "damaged .file must be str"), ("index.jsonl", {"dt": 9.0}, "the index says 9"),
     ("index.jsonl", {"file": "segments/\0"}, "no file of this folder"),
     ("index.jsonl", {"file": "segments/../a"}, "no file of this folder"),
     ("index.jsonl", {"rollouts": 10**9}, "line 1: 1000000000 rollouts"), ("index.jsonl", "3", "line 1 is damaged"),
-    ("index.jsonl", "[" * 100_000, "line 1 is damaged"),
+    ("index.jsonl", "[" * 100_000, "line 1 is damaged"), ("index.jsonl", {"rollouts": 3}, "the index says 3"),
     *(("manifest.json", {name: [3]}, "must be") for name in ("agent", "seed", "drivers", "settings", "store")),
     ("manifest.json", {"format": 9}, "format 1"), ("manifest.json", "[" * 100_000, "not valid JSON"),
 ])  # fmt: skip
@@ -206,7 +206,7 @@ def test_an_index_or_a_manifest_that_lies_is_refused(file, change, message, tmp_
     text = change if isinstance(change, str) else json.dumps(json.loads(path.read_text()) | change)
     path.write_text(text + "\n")
     with pytest.raises(DataError, match=message):
-        load_rollouts(tmp_path / "sim")
+        load_rollouts(tmp_path / "sim")[0]
 
 
 def test_a_simulation_is_kept_whatever_the_batch_and_the_interruptions(tmp_path):

@@ -197,7 +197,11 @@ class RolloutFolder:
             raise DataError(f"can't be read: {error.strerror}", file=file, segment=segment) from error
         if hashlib.sha256(data).hexdigest() != entry.sha256:
             raise DataError("damaged: not what was written", file=file, segment=segment, field="sha256")
-        return read_tensors(data, file, segment)
+        saved = read_tensors(data, file, segment)
+        for name, told, held in (("rollouts", entry.rollouts, saved.rollouts), ("dt", entry.dt, saved.segment.dt)):
+            if told != held and not math.isnan(told):  # older ones lack dt
+                raise DataError(f"is {held:g}, the index says {told:g}", file=file, segment=segment, field=name)
+        return saved
 
     def __iter__(self) -> Iterator[SavedRollouts]:
         return (self[i] for i in range(len(self)))
