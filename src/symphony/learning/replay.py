@@ -111,8 +111,8 @@ class SearchReplay:
         return batch.set(keys.ROLLOUT, torch.ones_like(batch.get(keys.VALID)))
 
     def blamed(self, count: int, rng: torch.Generator, observation: ObservationConfig) -> TensorDict:
-        """Return K states of rollouts of a search that keeps all branches, drawn as often as they matter, as
-        :meth:`survivors` does, with the ``WEIGHT`` [K, N] of their actions in a policy gradient (:func:`advantages`).
+        """Return K states of rollouts of a search that keeps all branches, drawn as often as they matter: a batch
+        as of :meth:`survivors`, with the ``WEIGHT`` [K, N] of the actions in a policy gradient (:func:`advantages`).
         """
         found = advantages(self.env, self.leaves)
         share = found.abs().amax(-1).flatten().clamp_min(1e-9)
