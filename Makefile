@@ -17,7 +17,7 @@ EXTRAS := dev,docs,argoverse2,ray,sumo,gym,video,mcap
 SPELLED := src tests recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md SECURITY.md
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo picture table test test-lowest fuzz kills flat mutate coverage audit bench lint format docs clean
+.PHONY: help setup demo picture table test test-lowest fuzz kills mutate coverage audit bench lint format docs clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-12s %s\n", $$1, $$2}'
@@ -62,9 +62,6 @@ coverage: $(DEV)  ## run the tests in one process and report which branches of s
 	$(INSTALL) 'coverage>=7.6'
 	OMP_NUM_THREADS=1 $(BIN)/python -m coverage run --branch --source=src/symphony -m pytest -q
 	$(BIN)/python -m coverage report --skip-covered --sort=cover
-
-flat: $(DEV)  ## train and evaluate for long and report whether memory and open files grow
-	OMP_NUM_THREADS=1 nice $(BIN)/python tests/tools/flat.py
 
 audit: $(DEV)  ## ask a public database for known vulnerabilities of the pinned packages
 	$(INSTALL) 'pip-audit>=2.7'

@@ -12,6 +12,7 @@ from made import NORTH, OWN, Case, segment_of
 from scenes import car, cases, ego
 
 from helpers_saved import played
+from helpers_segments import hide, turned
 from symphony.data.segment import AgentType
 from symphony.envs.flags import offroad_flags
 from symphony.envs.objects import rollout_heights
@@ -122,3 +123,12 @@ def test_who_stands_on_a_bridge_is_not_drawn_as_hit() -> None:
     draw_hit(axes := new_figure(4, 4).add_subplot(), saved_clip(saved))
     (drawn,) = (artist for artist in axes.get_children() if artist.get_gid() == "hit")
     assert len(drawn.get_paths()) == len(found.other) == 1
+
+
+@pytest.mark.parametrize("hidden", [slice(1, 7), slice(2, 7), slice(1, 4)])
+def test_who_cuts_in_unseen_is_judged_where_it_is_seen_again(hidden: slice) -> None:
+    case = next(each for each in cases() if each.name == "another cuts in closely and brakes")
+    segment = hide(segment_of(case, 0.2, 0.0)[0], 1, hidden)
+    for shift in (0.0, -100.0, 500.0):
+        add_segment(found := Report("made", "ego"), played(turned(segment, 0.0, np.array([shift, 0.0]))))
+        assert found.rows[0]["at_fault_collision"] is False

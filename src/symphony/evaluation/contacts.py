@@ -257,10 +257,12 @@ def _cut_in(world: World, rear: Indices, front: Indices, step: Indices, dt: floa
     half, turned = 0.5 * world.size, world.heading[front[:, None], times]
     corners = box_corners(from_numpy(theirs), from_numpy(turned), from_numpy(world.size[front, None]))
     away = shapely.distance(shapely.linestrings(path)[:, None], shapely.polygons(corners.numpy()))
-    outside = seen & world.valid[front[:, None], times] & (away > half[rear, 1:])
-    # The first state from which on it stays in the path.
+    both = seen & world.valid[front[:, None], times]
+    outside = both & (away > half[rear, 1:])
+    # The first state in which both are seen from which on it stays in the path, or the last one before.
     entered = outside.shape[1] - outside[:, ::-1].argmax(1)
-    at = np.arange(len(rear)), np.minimum(entered, outside.shape[1] - 1)
+    later = both & (np.arange(both.shape[1]) >= entered[:, None])
+    at = np.arange(len(rear)), np.where(later.any(1), later.argmax(1), entered - 1)
     gap = ((theirs[at] - ours[at]) * direction[at]).sum(-1) - half[rear, 0] - half[front, 0]
     behind, ahead = (np.linalg.norm(world.velocity[row, times[at]], axis=-1) for row in (rear, front))
     # Beyond this many metres the one behind can stop (RSS).

@@ -128,20 +128,24 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
     found = []
     # There are few crossings.
     for m, t in zip(*(part.tolist() for part in passing.any(-1).nonzero()), strict=True):
-        best, least = -1, _FOLLOWED
+        best, least = -1, math.inf
         # Lanes that part here differ in direction, so that one front may cross their stop points in different steps.
         beside = np.linalg.norm(stop - stop[passing[m, t].argmax()], axis=-1) < _PASSED
         for light in (passing[m].any(0) & beside).nonzero()[0]:
             at_end = along_lane[light] > 0.5 * length[light]
             part = slice(0, t + 1) if at_end else slice(t + 1, None)
             path = world.position[evaluated[m], part][world.valid[evaluated[m], part]]
-            # A step may be longer than the lane; a way may have no length.
-            way = shapely.linestrings(np.concatenate([path[:1], path]))
+            way = shapely.linestrings(np.concatenate([path[:1], path]))  # which may have no length
             points = shapely.line_interpolate_point(way, np.arange(way.length + 1))
-            points = points[shapely.distance(points, shapely.points(stop[light])) <= length[light]]
-            if len(points):
-                distance = float(shapely.distance(lines[light], points).mean())
-                best, least = (int(light), distance) if distance < least else (best, least)
+            off = shapely.distance(points, shapely.points(stop[light]))
+            # A step may be longer than the lane, and so may an agent, whose centre is still before it.
+            points, line = points[off <= max(length[light], off.min())], graph.lines[lane[light]]
+            reach = 0.5 * world.size[evaluated[m], 0] + np.linalg.norm(stop[light] - line[0])
+            before = line[:1] + reach * (line[0] - line[1]) / np.linalg.norm(line[0] - line[1])
+            longer = shapely.linestrings(np.concatenate([before, line]))
+            distance = float(shapely.distance(lines[light], points).mean())
+            if distance < least and shapely.distance(longer, points).mean() < _FOLLOWED:
+                best, least = int(light), distance
         # One that changes just then is not held against the agent.
         shown = segment.signal_state[known[best], start + t : start + t + 2]
         if best >= 0 and passing[m, t, best] and np.isin(shown, RED).all():
