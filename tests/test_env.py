@@ -17,7 +17,7 @@ from torchrl.envs.utils import RandomPolicy, check_env_specs
 from torchrl.modules import AdditiveGaussianModule
 
 from helpers_segments import crossing, straight_road, turned
-from symphony import DrivingEnv, ObservationConfig, keys
+from symphony import DrivingEnv, ObservationConfig, SegmentStore, builtin_store, keys
 from symphony.collectors import with_rows
 from symphony.envs import Bicycle, ConstantVelocity, Displacement, collate, scene
 from symphony.envs import flags as module
@@ -25,6 +25,7 @@ from symphony.envs.flags import collision_flags
 from symphony.envs.objects import Objects
 from symphony.envs.observation import observe_states
 from symphony.errors import ConfigError
+from symphony.learning import SceneDataset
 from symphony.roadgraph import LaneGraph
 
 FEW = ObservationConfig(num_objects=4, num_points=60)
@@ -80,6 +81,21 @@ def test_a_fixed_batch_runs_in_torchrls_collector():
     assert [b.shape for b in batches] == [(3, 60), (3, 60)]
     # Fifty decisions a segment: one reset falls into the first batch of each row.
     assert batches[0]["next", "done"].sum(1).flatten().tolist() == [1, 1, 1]
+
+
+def test_a_source_gives_torchrls_collector_new_scenes_and_a_start_in_a_collision_is_no_end():
+    data, seen = SceneDataset(SegmentStore(builtin_store("train"))), set()
+    env = with_rows(DrivingEnv(data, observation=ObservationConfig.nothing(), ends_on=("collision",), seed=0), [1])
+    for batch in Collector(env, RandomPolicy(env.action_spec), frames_per_batch=50, total_frames=300):
+        seen |= set(batch["segment"].flatten().tolist())
+    assert len(seen) > 4
+    scenes = make_env(straight_road()).scenes
+    scenes.log_state[:, 0, 1] = scenes.log_state[:, 0, 0]
+    env = DrivingEnv(scenes, ends_on=("collision",))
+    start = env.reset()
+    assert start[keys.COLLISION].all()
+    assert not start["done"].any()
+    assert env.step(start.set(keys.ACTION, torch.full((2,), 73)))["next", "terminated"].all()
 
 
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])

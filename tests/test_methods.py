@@ -328,6 +328,8 @@ def test_fitted_states_are_the_experts_and_transitions_lead_through_them(store, 
     (off := env.scenes.clone()).route_logged.fill_(-1)  # on no lane, which is not forgotten
     monkeypatch.setattr(data, "scenes", lambda items: off)
     assert len(transitions(data, items, sees)) == len(found)
+    with pytest.raises(ConfigError, match="routes=True"):
+        transitions(SceneDataset(SegmentStore(store), 2, dynamics), items, sees)
 
 
 def test_one_search_serves_as_many_updates_as_configured(store, tmp_path, monkeypatch):

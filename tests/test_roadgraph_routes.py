@@ -193,6 +193,14 @@ def test_lanes_that_do_not_meet_are_joined_without_a_jump(gap):
     np.testing.assert_allclose(line[-1], after[-1])
 
 
+@pytest.mark.parametrize("gap", [0.01, 0.03, 1.0])
+def test_a_ring_that_does_not_close_is_driven_around_again(gap):
+    angle = np.linspace(0.0, 2.0 * np.pi - gap / 20.0, 125)[:, None]
+    graph = LaneGraph(make_road([20.0 * np.concatenate([np.cos(angle), np.sin(angle)], -1)], [(0, 0)]))
+    line = route_line(graph, routes(graph, [(0, 100.0)])[0], 100.0)
+    assert np.hypot(*np.diff(line, axis=0).T).sum() > 250.0
+
+
 @functools.cache
 def maps():
     """Graphs with every kind of junction and of change, each with the lanes it is entered by."""

@@ -283,7 +283,8 @@ class DrivingEnv(EnvBase):
         if named is not None and partial is None:
             scene = named.squeeze(-1)
         else:
-            scene = self._draw(tensordict.batch_size, renew=partial is None).to(self.device)
+            renew = partial is None or (self.source is not None and bool(partial.all()))
+            scene = self._draw(tensordict.batch_size, renew=renew).to(self.device)
         rollout = torch.randint(1 << 31, tuple(scene.shape), generator=self._rng).to(self.device)
         fresh = self.start(scene, rollout)
         if partial is None:
@@ -390,7 +391,7 @@ class DrivingEnv(EnvBase):
         flags = {keys.COLLISION: collision, keys.OFFROAD: offroad}
         terminated = _nowhere(moved, real).any(-1)
         for key in self.ends_on:
-            terminated = terminated | flags[key].any(-1)
+            terminated = terminated | flags[key].any(-1) & (at > 0)  # a reset must not end it
 
         def back(value: Shaped[Tensor, "M ..."]) -> Shaped[Tensor, "*_"]:
             return value.reshape((*shape, *value.shape[1:]))

@@ -63,7 +63,7 @@ def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
 def nearest(squared: Float[Tensor, "*b K"], count: int) -> tuple[Int[Tensor, "*b n"], Bool[Tensor, "*b n"]]:
     """Return the indices [..., count] of the smallest elements and which are finite; the rest is padded with index 0.
 
-    Ties go to the elements that come first; on the CPU in ascending order of the index.
+    In ascending order of the index; ties go to the elements that come first.
     """
     width = squared.shape[-1]
     if width <= count:
@@ -75,7 +75,7 @@ def nearest(squared: Float[Tensor, "*b K"], count: int) -> tuple[Int[Tensor, "*b
         # Numbers of bits in the order of what is not negative, and among equals in that of their places.
         bits = squared.detach().float().contiguous().view(torch.int32).long()
         order = (bits << 32) + torch.arange(width, device=squared.device)
-        index = order.topk(count, dim=-1, largest=False, sorted=False).indices
+        index = order.topk(count, dim=-1, largest=False, sorted=False).indices.sort(-1).values
     found = squared.gather(-1, index) < torch.inf
     if width < count:
         index, found = (pad(value, (0, count - width)) for value in (index, found))

@@ -24,7 +24,7 @@ from symphony.envs.dynamics import Bicycle, Displacement
 from symphony.envs.observation import ObservationConfig
 from symphony.envs.routes import FollowedRoutes, RouteWindow, packed, route_choices
 from symphony.envs.scene import SceneBatch, collate, scene
-from symphony.errors import DataError, DataWarning
+from symphony.errors import ConfigError, DataError, DataWarning
 from symphony.geometry.frames import with_speed
 from symphony.learning.experts import Experts, KeptExperts, expert_batch, fit_experts, logged, logged_routes
 from symphony.roadgraph import LaneGraph
@@ -143,9 +143,9 @@ class SceneDataset:
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
         self.routes, self.duration, self.keep, self.few_shapes = routes, duration, keep, few_shapes
-        self.scene = ItemCache(
-            lambda items: [self._scene(i) for i in items], _nbytes, keep=keep, name="prepared run segments"
-        )
+        made, names = (lambda items: [self._scene(i) for i in items]), tuple(SceneBatch.__annotations__)
+        size = lambda found: sum(getattr(found, name).nbytes for name in names)  # noqa: E731
+        self.scene = ItemCache(made, size, keep=keep, name="prepared run segments")
         self.experts = ItemCache(self.fit, attrgetter("nbytes"), keep=keep, name="demonstrations")
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))
@@ -386,11 +386,13 @@ def transitions(
         ``"next"``, segment by segment in the order of time. ``VALID`` are agents whose action the log shows; steps
         without any are left out. The last step of a segment is ``truncated``.
     """
-    from symphony.envs.driving import DrivingEnv  # noqa: PLC0415 - cloning needs no environment
+    from symphony.envs.driving import NO_ROUTES, DrivingEnv  # noqa: PLC0415 - cloning needs no environment
 
     items = range(len(data)) if items is None else items
     scenes = data.scenes(items)
     env, fit = DrivingEnv(scenes, data.dynamics, observation, **how), data.fitted(items, scenes)
+    if env._follows and not data.routes:
+        raise ConfigError(NO_ROUTES)
     row = torch.arange(len(scenes))[:, None].expand(fit.known.shape[:2])
     step = torch.arange(row.shape[1]).expand(row.shape)
     route = scenes.route_logged if data.routes else torch.full_like(scenes.interactive, -1)
@@ -402,7 +404,3 @@ def transitions(
     for part in (found, found.get("next")):
         part.set(keys.VALID, fit.known)
     return found[fit.known.any(-1)]
-
-
-def _nbytes(scene: SceneBatch) -> int:
-    return sum(getattr(scene, name).nbytes for name in SceneBatch.__annotations__)

@@ -92,8 +92,9 @@ def followed(graph: LaneGraph, before: int, lane: int) -> Reals:
         line, end = graph.lines[lane], graph.lines[before][-1]
         gap = float(np.hypot(*(line[0] - end)))
         if gap > _JOINED:
-            aside = min(beside(line, end)[1], gap)
-            line = blend(line, end, _JOIN * aside)
+            near = int(np.searchsorted(graph.arc[lane], 20.0 + 7.0 * gap)) + 1  # a circuit comes by here again
+            aside = min(beside(line[:near], end)[1], gap)
+            line = np.concatenate([blend(line[:near], end, _JOIN * aside), line[near:]])
         known = graph.followed[before, lane] = distinct(np.concatenate([end[None], line]))[1:]
     return known
 
