@@ -1,8 +1,7 @@
 """A device that exists in name only, to test code for accelerators on a machine that has none.
 
-Inside :func:`pretend` tensors have shapes, types and devices but no numbers. PyTorch itself refuses to mix devices
-and to read a number; copies between device and host, which would wait for the device, are noted here. Constants that
-the package makes once per device are counted apart.
+Inside :func:`pretend` tensors have no numbers. PyTorch itself refuses to mix devices and to read a number; copies
+between device and host, which would wait, are noted; constants that are made once per device are counted apart.
 """
 
 from __future__ import annotations

@@ -60,10 +60,8 @@ def learned(loss, td):
 
 
 def check_contract(make, td, parameters, dirty=None):
-    """Keys, dispatch, gradients, state, copies and refusals of a loss.
-
-    `make(**arguments)` builds the loss with a network of its own, always with the same weights; `td` is a batch for
-    it, its network trains so many `parameters`, and `dirty` batches differ from `td` in what does not count.
+    """Keys, dispatch, gradients, state, copies and refusals of a loss that ``make`` builds, always with the same
+    weights, for a batch; its network trains so many ``parameters``; ``dirty`` batches differ in what does not count.
     """
     loss = make()
     (name,) = (key for key in loss.out_keys if key.startswith("loss"))

@@ -47,10 +47,9 @@ def serve_from_here() -> None:
 
 
 def apart(function: Callable[..., Any], *given: Any, said: Path | None = None) -> BaseProcess:
-    """Start a function of a module, whose result is the exit status (``None`` for 0); arguments are pickled.
-
-    On Linux its process is forked from one that has imported what this one had when tests began, and has no threads:
-    it may fork, too. What it prints comes into a file, errors into a second, whose name ends on ``.err``.
+    """Start a function of a module, whose result is the exit status (``None`` for 0); arguments are pickled. On Linux
+    its process is forked from one without threads. What it prints comes into a file, errors into one that ends on
+    ``.err``.
     """
     process = multiprocessing.get_context(engine._START).Process(target=_run, args=(function, given, said))
     process.start()
@@ -92,10 +91,8 @@ def forget(*packages: str) -> None:
 
 
 def share_the_server() -> None:
-    """Have workers of this process, itself started by :func:`apart`, forked from the same server (Linux).
-
-    A program would start a server of its own for them, which takes seconds. Not for processes that are killed: the
-    server ends if that happens between their call and what they have to say.
+    """Have workers of this process, started by :func:`apart`, forked from the same server (Linux): another would
+    take seconds. Not for processes that are killed, with which the server may end.
     """
     if engine._START == "forkserver":
         forkserver._forkserver.ensure_running = forkserver.ensure_running = resource_tracker.ensure_running

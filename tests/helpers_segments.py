@@ -101,9 +101,8 @@ def along(path: NDArray[Any], distance: NDArray[Any]) -> tuple[NDArray[Any], NDA
 
 
 def straight_road(num_agents=3, steps=51, dt=0.2, seed=0, num_lanes=3, **changes: Any) -> RunSegment:
-    """Cars at constant speeds (8-15 m/s, one per lane) on a one-way road along +x; nobody touches anybody.
-
-    Lane 0 is the rightmost, at y = 0. Agent k drives in lane k modulo ``num_lanes``.
+    """Cars at constant speeds (8-15 m/s, one per lane) on a one-way road along +x; nobody touches anybody. Lane 0 is
+    the rightmost, at y = 0. Agent k drives in lane k modulo ``num_lanes``.
     """
     rng = np.random.default_rng(seed)
     rows = -(-num_agents // num_lanes)
@@ -168,9 +167,8 @@ def crossing_road(arm: float = 120.0) -> RoadMap:
 
 
 def crossing(num_agents=4, steps=51, dt=0.2, seed=0, **changes: Any) -> RunSegment:
-    """Cars at 6 m/s that pass a crossing one after the other, 2.5 s apart, each turning as the seed says.
-
-    Agent k comes from arm k modulo 4. One light per lane inside the crossing: arms 0 and 2 have green first.
+    """Cars at 6 m/s that pass a crossing one after the other, 2.5 s apart, each turning as the seed says: agent k
+    from arm k modulo 4. One light per lane inside the crossing: arms 0 and 2 have green first.
     """
     rng = np.random.default_rng(seed)
     speed, gap = 6.0, 2.5

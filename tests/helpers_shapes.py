@@ -1,8 +1,6 @@
-"""A type checker for jaxtyping that looks at tensors alone; mypy has seen to the rest.
+"""A type checker for jaxtyping that looks at tensors alone, for tests with all shapes and dtypes checked:
 
-    pytest --jaxtyping-packages=symphony,helpers_shapes.tensors_only tests/...
-
-runs tests with every shape and kind of number checked that a signature of the package promises.
+pytest --jaxtyping-packages=symphony,helpers_shapes.tensors_only tests/...
 """
 
 from __future__ import annotations

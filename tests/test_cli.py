@@ -91,10 +91,11 @@ def test_rates_that_are_hunted_are_those_of_a_suite() -> None:
     assert list(get_args(Rate)) == rates
 
 
-def test_installed_command_prints_the_version() -> None:
+def test_installed_command_prints_whatever_the_terminal_can_show(store: Path) -> None:
     command = Path(sys.executable).with_name("symphony")
-    done = subprocess.run([command, "--version"], capture_output=True, text=True, check=True)
-    assert done.stdout == f"symphony {__version__}\n"
+    how: Any = {"capture_output": True, "text": True, "env": {**os.environ, "PYTHONIOENCODING": "ascii"}}
+    assert subprocess.run([command, "--version"], check=True, **how).stdout == f"symphony {__version__}\n"
+    assert r"\u2013" in subprocess.run([command, "data", "info", str(store)], check=True, **how).stdout
 
 
 WRONG = """

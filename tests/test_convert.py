@@ -185,10 +185,20 @@ def test_the_merged_store_holds_every_segment_as_it_was(tmp_path: Path) -> None:
     assert merged.groups.tolist() == [name for store in stores for name in store.groups.tolist()]
 
 
-def test_a_merge_that_was_killed_is_begun_anew(tmp_path: Path) -> None:
+def test_a_merge_that_was_killed_is_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with StoreWriter(tmp_path / "all.merging") as writer:
         writer.copy(SegmentStore(PARTS[0]), 3)
         with pytest.raises(DataError, match="another process"):
+            merge(PARTS[1:], tmp_path / "all")
+
+    def stopped(path: Path, **_: Any) -> None:
+        if path.suffix != ".lock":
+            raise KeyboardInterrupt
+        os.unlink(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", stopped)
+        with pytest.raises(KeyboardInterrupt):  # while what it left is removed
             merge(PARTS[1:], tmp_path / "all")
     assert merge(PARTS[1:], tmp_path / "all").checksum() == SegmentStore(PARTS[1]).checksum()
     assert not (tmp_path / "all.merging").exists()
@@ -310,11 +320,7 @@ def write(folder: Path, paths: dict[str, list[str]]) -> list[Path]:
 
 
 def snapshots(folder: Path, action: Callable[[], Any]) -> list[Path]:
-    """Copies of a folder as a process would leave it that is killed before it changes a file.
-
-    Of the many like moments, between the columns of one record and between the files of one store that is
-    removed, a few.
-    """
+    """Copies of a folder as a process leaves it that is killed before it changes a file; a few of like moments."""
     taken: list[Path] = []
     count = itertools.count()
 

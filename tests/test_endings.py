@@ -92,6 +92,9 @@ def test_what_is_written_is_whole_or_not_there(tmp_path):
     write_file(pipe, "text")
     assert (os.read(reader, 10), pipe.is_fifo()) == (b"text", True)
     os.close(reader)
+    reader, writer = os.pipe()
+    write_file(Path(f"/dev/fd/{writer}"), "text")
+    assert os.read(reader, 10) == b"text"
 
 
 SLOW = """

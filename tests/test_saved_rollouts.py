@@ -118,7 +118,8 @@ def test_another_simulation_or_folder_is_refused(tmp_path):
     with pytest.raises(DataError, match="not a folder of rollouts"):
         load_rollouts(tmp_path / "shop")
     (tmp_path / "shop" / "index.jsonl").write_text("")
-    (tmp_path / "shop" / "rollouts.lock").touch()  # left by a writer that was killed before its manifest
+    for name in ("rollouts.lock", ".manifest.1.new.json"):  # of a writer that was killed before its manifest
+        (tmp_path / "shop" / name).touch()
     RolloutWriter(tmp_path / "shop", ABOUT).close()
 
 

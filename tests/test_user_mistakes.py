@@ -23,6 +23,7 @@ from symphony.agents.agent import build_agent
 from symphony.cli import ALL_FAILED, main
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
+from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError
 from symphony.planners.identity import source_of
 from symphony.rollouts.crowd import crowd_dataset
@@ -153,12 +154,22 @@ def test_other_weights_or_another_search_are_another_simulation(store: Path, run
 
 
 def test_a_folder_is_not_gone_on_with_by_another_simulation(store: Path, run: Path, told: Any) -> None:
-    command = ["simulate", run, "--data", store, "--rollouts", 2, "--out", "a"]
-    for segment in (0, 1):
-        assert told(*command, "--segments", segment)[0] == 0
+    command = ["--data", store, "--rollouts", 2, "--out", "a", "--segments"]
+    for segment, name in enumerate((run, f"{run}/")):  # as a shell completes it
+        assert told("simulate", name, *command, segment)[0] == 0
     assert len(load_rollouts("a")) == 2
-    code, words = told(*command, "--segments", 2, "--goals", "tree")
+    code, words = told("simulate", run, *command, 2, "--goals", "tree")
     assert (code, "differs in settings.goals" in words) == (1, True)
+
+
+@pytest.mark.parametrize(("words", "message"), [
+    ("plot routes --data empty", "no run segments"), ("simulate idm --data empty --runs 3", "no run segments"),
+    ("plot curvature nowhere", "nowhere/config.json: can't be read: No such file"),
+])  # fmt: skip
+def test_what_holds_nothing_is_named(told: Any, words: str, message: str) -> None:
+    StoreWriter("empty").close()
+    code, printed = told(*words.split(), "--out", "a.png")
+    assert (code, message in printed) == (1, True)
 
 
 def test_a_command_that_failed_leaves_nothing_in_the_way(store: Path, run: Path, told: Any) -> None:

@@ -29,6 +29,7 @@ from symphony.config.evaluation import EvaluateConfig, compiles
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation import Evaluation, evaluate
+from symphony.imports import load_object
 from symphony.learning.demonstrations import SceneDataset
 from symphony.parallel import WorkerError, ordered_map
 from symphony.rollouts.unroll import NotFiniteError
@@ -148,6 +149,13 @@ def test_a_worker_that_dies_names_the_segments_at_hand(store: SegmentStore) -> N
     named = str(error.value).rpartition(" segments ")[2].split(", ")
     assert store.ids[2] in named
     assert len(named) <= 2
+
+
+def test_what_a_file_defines_is_sent_by_its_path(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text("class Own:\n    size = 3\n\ndef made(items):\n    return Own().size\n")
+    made = load_object(f"{tmp_path}/own.py:made")
+    found = shared(made, [[0], [1]], EvaluateConfig(workers=2))
+    assert list(found) == [3, 3]
 
 
 def test_what_cannot_be_sent_is_refused(store: SegmentStore) -> None:

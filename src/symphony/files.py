@@ -55,6 +55,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _place(path: Path) -> Path:
+    if path.exists() and not path.is_file():
+        return path  # a pipe by way of `/dev/fd` is a link to what is no path
     place = Path(os.path.realpath(path))
     place.parent.mkdir(parents=True, exist_ok=True)
     return place

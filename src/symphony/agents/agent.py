@@ -258,6 +258,8 @@ def load_agent(name: str, device: str = "cpu", *, trust_code: bool = False) -> A
     if name == "random":
         return Agent(name, RandomActions(Bicycle()))
     folder, which = split_name(name)
+    if not name.startswith(PREFIX):  # `./RUN` and `RUN/` are the same agent
+        name = f"{folder}@{which}" if which else str(folder)
     spec = read_spec(folder)
     _check_code(spec, folder / FILE, trust_code)
     checkpoint = choose(folder, which)

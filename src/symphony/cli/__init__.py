@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
 import os
 import signal
 import sys
@@ -87,6 +88,8 @@ def main(args: Sequence[str] | None = None) -> int:
 def settle() -> None:
     """Apply the settings of a process of our own before it loads torch; the user's settings take precedence."""
     allocator.tune()
+    if isinstance(sys.stdout, io.TextIOWrapper):  # of an encoding that may lack `≤`
+        sys.stdout.reconfigure(errors="backslashreplace")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin take the cores of a busy machine
     cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", os.path.join(cache, "symphony", "compiled"))

@@ -107,7 +107,7 @@ class Routes(shared.Command):
         from symphony.learning.demonstrations import evenly_spaced
         from symphony.roadgraph import LaneGraph
 
-        store, panels = symphony.SegmentStore(self.data), []
+        store, panels = symphony.SegmentStore(self.data).filled(), []
         for number in shared.segment_indices(store, self.segments) or evenly_spaced(len(store), 3):
             segment = store[number]
             graph = LaneGraph(segment.road)

@@ -54,7 +54,7 @@ class Simulate(shared.Simulation):
         from symphony.saved.saving import save_simulation
 
         agent = symphony.load_agent(self.agent, self.config.device, trust_code=self.trust_code)
-        store, (planner, drives) = symphony.SegmentStore(self.data), named_planners(self.planner)
+        store, (planner, drives) = symphony.SegmentStore(self.data).filled(), named_planners(self.planner)
         config: EvaluateConfig = self.config
         config = dataclasses.replace(config, rollouts=config.trees) if self.runs else config
         config = beside_planner(config) if planner else config

@@ -451,7 +451,8 @@ def merge(paths: Sequence[Path], out: Path, progress: Told | None = None) -> Seg
         raise DataError("is a store, in the way of what is merged; move it", file=draft)
     if (draft / store_format.HEADER).is_file():  # of a merge that was killed, or goes on, which is told
         with store_format.lock(draft):
-            shutil.rmtree(draft)
+            for part in sorted(draft.iterdir(), key=lambda part: part.name == store_format.HEADER):
+                (shutil.rmtree if part.is_dir() else Path.unlink)(part)  # at last what says that it is a store
     total = sum(map(len, stores))
     with StoreWriter(draft) as writer:
         report = Report()
@@ -461,7 +462,7 @@ def merge(paths: Sequence[Path], out: Path, progress: Told | None = None) -> Seg
                 writer.copy(store, index)
                 if progress is not None:
                     progress(len(writer), total)
-        report = replace(report, converted=total, settings={"merged": [store.path.name for store in stores]})
-        writer.write_report(report.to_json())
+    report = replace(report, converted=total, settings={"merged": [store.path.name for store in stores]})
+    writer.write_report(report.to_json())
     draft.rename(out)
     return SegmentStore(out)

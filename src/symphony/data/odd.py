@@ -62,7 +62,11 @@ def oddities(segment: RunSegment) -> list[str]:
 
 def _lines(segment: RunSegment) -> RunSegment:
     road = segment.road
-    fine = {name: _plausible(getattr(road, name)) for name in ("lanes", "boundary", "marks")}
+    fine: dict[str, Bools] = {}
+    for name in ("lanes", "boundary", "marks"):
+        lines: Polylines = getattr(road, name)
+        bad = ~(np.abs(lines.points) <= PLACE).all(axis=1)
+        fine[name] = np.bincount(lines.line_index[bad], minlength=len(lines)) == 0
     wrong = [f"{name} {np.argmin(kept)}" for name, kept in fine.items() if not kept.all()]
     if not wrong:
         return segment
@@ -73,12 +77,6 @@ def _lines(segment: RunSegment) -> RunSegment:
         mark_type=road.mark_type[fine["marks"]],
     )
     return noted(with_lanes(segment.replace(road=road), fine["lanes"]), {NO_LINE: wrong[0]})
-
-
-def _plausible(lines: Polylines) -> Bools:
-    """Return [K] whether all points of a line are plausible."""
-    bad = ~(np.abs(lines.points) <= PLACE).all(axis=1)
-    return np.bincount(lines.line_index[bad], minlength=len(lines)) == 0
 
 
 def _states(segment: RunSegment) -> RunSegment:

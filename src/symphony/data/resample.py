@@ -42,14 +42,11 @@ def resample(segment: RunSegment, dt: float) -> RunSegment:
     ratio = dt / segment.dt
     every = round(ratio)
     if every >= 1 and abs(ratio - every) < 1e-6 * every:
-        return validate(_pick(segment, every, dt))
+        lights = _lights(segment.signal_state, np.arange(0, segment.num_steps, every))
+        picked = {name: getattr(segment, name)[:, ::every].copy() for name in STATES}
+        step = segment.current_step // every
+        return validate(segment.replace(dt=dt, signal_state=lights, current_step=step, **picked))
     return validate(_interpolate(segment, ratio, dt))
-
-
-def _pick(segment: RunSegment, every: int, dt: float) -> RunSegment:
-    lights = _lights(segment.signal_state, np.arange(0, segment.num_steps, every))
-    picked = {name: getattr(segment, name)[:, ::every].copy() for name in STATES}
-    return segment.replace(dt=dt, signal_state=lights, current_step=segment.current_step // every, **picked)
 
 
 def _lights(state: Ints, steps: Ints) -> Ints:

@@ -67,6 +67,12 @@ class SegmentStore(Sequence[RunSegment]):
     def __len__(self) -> int:
         return len(self._segments)
 
+    def filled(self) -> SegmentStore:
+        """Return the store itself; a :class:`DataError` if it holds no run segments."""
+        if not len(self):
+            raise DataError("the store holds no run segments", file=self.path)
+        return self
+
     @overload
     def __getitem__(self, index: SupportsIndex) -> RunSegment: ...
     @overload

@@ -151,7 +151,9 @@ def read_json(path: Path) -> dict[str, Any]:
     """Parse a JSON object; a :class:`DataError` if it can't be read, or is not one."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
+        raise DataError(f"can't be read: {error.strerror or error}", file=path) from error
+    except (ValueError, RecursionError) as error:
         raise DataError(f"not valid JSON ({error})", file=path) from error
     if not isinstance(found, dict):
         raise DataError("not a JSON object", file=path)

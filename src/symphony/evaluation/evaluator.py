@@ -22,7 +22,7 @@ from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.objects import rollout_heights
 from symphony.envs.scene import SceneBatch
-from symphony.errors import ConfigError, DataError
+from symphony.errors import ConfigError
 from symphony.imports import build_object, load_object
 from symphony.learning.demonstrations import SceneDataset
 from symphony.learning.experts import logged, logged_heights
@@ -99,9 +99,7 @@ def evaluate(
             raise ConfigError("items are those of a store; these scenes are chosen already")
         dataset = data
     else:
-        store = data if isinstance(data, SegmentStore) else SegmentStore(data)
-        if len(store) == 0:
-            raise DataError("the store holds no run segments", file=store.path)
+        store = (data if isinstance(data, SegmentStore) else SegmentStore(data)).filled()
         dataset = crowd_dataset(store, agent, config, items)
     agent.check_step(dataset.dt)
     others = [load_agent(name, config.device) for name in BASELINES] if baselines else []

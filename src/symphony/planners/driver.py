@@ -296,7 +296,9 @@ class _Asked(_Driver):
             else:
                 (control if len(found) == 2 else target)[m] = found
                 if np.ndim(given) == 2:
-                    self._meant[numbers[m]][steps[m]] = _shown(given)
+                    points = np.asarray(given, np.float32)[:, :2]
+                    shown = np.linspace(0, len(points) - 1, min(len(points), POINTS)).round().astype(int)
+                    self._meant[numbers[m]][steps[m]] = points[shown]  # the last one is among them
         length = [float(self.egos.segments[row].size[self.rows[row], 0]) for row in rows]
         pulled, turned = torch.from_numpy(control).unbind(-1)
         after = bicycle_step(own, pulled, turned, torch.tensor(length, dtype=torch.float64), self.env.dt)
@@ -356,12 +358,6 @@ def route_from(route: NDArray[Any], progress: float) -> NDArray[np.float64]:
     # The last piece may be shorter than the others.
     share = min((progress - SPACING * piece) / max(float(np.hypot(*way)), 1e-6), 1.0)
     return np.concatenate([(route[piece] + share * way)[None], later])
-
-
-def _shown(plan: Any) -> NDArray[np.float32]:
-    """Return points [H, 2] of a trajectory, at most :data:`POINTS` of them, the last among them."""
-    points = np.asarray(plan, np.float32)[:, :2]
-    return points[np.linspace(0, len(points) - 1, min(len(points), POINTS)).round().astype(int)]
 
 
 def _words(error: Exception) -> str:

@@ -79,9 +79,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
             raise ConfigError(f"action is discrete or continuous, not {action!r}")
         if not 0 <= duration < math.inf:
             raise ConfigError(f"duration must not be negative, is {duration}")
-        self.store = data if isinstance(data, SegmentStore) else SegmentStore(data)
-        if len(self.store) == 0:
-            raise DataError("the store holds no run segments", file=self.store.path)
+        self.store = (data if isinstance(data, SegmentStore) else SegmentStore(data)).filled()
         self.dynamics: Bicycle | Displacement = Bicycle() if action == "discrete" else Displacement()
         self.observation = ObservationConfig() if observation is None else observation
         self.reward, self.ends_on, self.duration = reward, tuple(ends_on), duration

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import pickle
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import lru_cache
+from types import FunctionType
 from typing import Any, TypeVar, cast
 
 import torch
@@ -16,6 +18,7 @@ from symphony.agents import Agent
 from symphony.config import EvaluateConfig
 from symphony.config.evaluation import TOGETHER, compiles
 from symphony.errors import ConfigError, SymphonyError
+from symphony.imports import load_object
 from symphony.learning.demonstrations import SceneDataset
 from symphony.parallel import WorkerError, ordered_map
 from symphony.rollouts.search import FILL
@@ -69,6 +72,16 @@ def batches(items: Sequence[int], size: int, config: EvaluateConfig) -> list[lis
     return [list(items[first : first + size]) for first in range(0, len(items), size)]
 
 
+class _Pickler(pickle.Pickler):
+    """Sends what a file of the user's defines by its import path: nothing else finds such a module."""
+
+    def reducer_override(self, value: Any) -> Any:
+        module, name = (getattr(value, part, None) for part in ("__module__", "__qualname__"))
+        if isinstance(value, type | FunctionType) and str(module).endswith(".py") and "<" not in str(name):
+            return load_object, (f"{module}:{name}",)
+        return NotImplemented
+
+
 def shared(
     work: Work[T, R], tasks: Iterable[T], config: EvaluateConfig, dataset: SceneDataset | None = None
 ) -> Generator[R, None, None]:
@@ -84,10 +97,10 @@ def shared(
         yield from map(work, tasks)
         return
     try:
-        sent = pickle.dumps(work)
+        _Pickler(sent := io.BytesIO()).dump(work)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise ConfigError(f"can't be shared among processes: {error}") from error
-    pairs, imports = ((sent, task) for task in tasks), [getattr(work, "func", type(work)).__module__]
+    pairs, imports = ((sent.getvalue(), task) for task in tasks), [getattr(work, "func", type(work)).__module__]
     done = ordered_map(_done, pairs, workers=config.workers, engine=config.engine, imports=imports)
     with closing(done) as results:
         try:

@@ -94,8 +94,8 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
         self.path = Path(path)
         with naming(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
-        there = set(os.listdir(self.path))
-        # Of a writer that was killed before there was a manifest its lock is left.
+        there = {name for name in os.listdir(self.path) if not name.startswith(f".{Path(MANIFEST).stem}.")}
+        # Of a writer that was killed before there was a manifest its lock is left, or a draft of it.
         if MANIFEST not in there and there and (LOCK not in there or there - {LOCK, SEGMENTS, INDEX}):
             raise DataError("not empty and not a folder of rollouts: refusing to write into it", file=self.path)
         self._lock = Lock(self.path / LOCK)

@@ -20,7 +20,7 @@ from symphony.agents.choice import Best
 from symphony.config import EvaluateConfig, RunConfig
 from symphony.data.store import SegmentStore
 from symphony.envs.scene import SceneBatch
-from symphony.errors import ConfigError, DataError
+from symphony.errors import ConfigError
 from symphony.evaluation.evaluator import evaluate
 from symphony.files import naming
 from symphony.geometry.frames import wrap
@@ -74,9 +74,7 @@ class Validator:
         if agent.searches and config.rollouts > branches:
             most = f"search.test-branches ({branches}), the branches of one tree"
             raise ConfigError(f"validation.rollouts ({config.rollouts}) must not exceed {most}")
-        store = SegmentStore(config.data or Path())
-        if len(store) == 0:
-            raise DataError("the store holds no run segments", file=store.path)
+        store = SegmentStore(config.data or Path()).filled()
         chosen = evenly_spaced(len(store), config.segments)
         how: Any = {"routes": agent.goals is not None, "duration": agent.duration, "keep": len(chosen)}
         self.dataset = SceneDataset(store, agent.interactive, agent.dynamics, chosen, **how)

@@ -96,10 +96,6 @@ def _array(data: Any, dtype: Any, shape: Any, order: Any) -> NDArray[Any]:
     return np.frombuffer(data, dtype.found).reshape(shape, order="F" if order == "F" else "C")
 
 
-def _scalar(dtype: Any, data: Any) -> Any:
-    return _array(data, dtype, (1,), "C")[0].item()
-
-
 def _never(*_: Any) -> Any:
     raise DataError("makes an array by itself")
 
@@ -107,7 +103,7 @@ def _never(*_: Any) -> Any:
 _NAMES: dict[tuple[str, str], Any] = {("numpy", "ndarray"): _Named(_never), ("numpy", "dtype"): _Named(_Type)}
 for _core in ("core", "_core"):
     _NAMES[f"numpy.{_core}.multiarray", "_reconstruct"] = _Named(lambda *_: Array())
-    _NAMES[f"numpy.{_core}.multiarray", "scalar"] = _Named(_scalar)
+    _NAMES[f"numpy.{_core}.multiarray", "scalar"] = _Named(lambda kind, data: _array(data, kind, (1,), "C")[0].item())
     _NAMES[f"numpy.{_core}.numeric", "_frombuffer"] = _Named(Array)
 
 
