@@ -154,11 +154,12 @@ def test_other_weights_or_another_search_are_another_simulation(store: Path, run
 
 
 def test_a_folder_is_not_gone_on_with_by_another_simulation(store: Path, run: Path, told: Any) -> None:
-    command = ["--data", store, "--rollouts", 2, "--out", "a", "--segments"]
-    for segment, name in enumerate((run, f"{run}/")):  # as a shell completes it
-        assert told("simulate", name, *command, segment)[0] == 0
+    command = ["--rollouts", 2, "--out", "a", "--data"]
+    for segment, end in enumerate(("", "/../" + Path(store).name)):  # as a shell completes it, or somebody types it
+        again = f"{run}{end[:1]}", *command, f"{store}{end}", "--segments"
+        assert told("simulate", *again, segment)[0] == 0
     assert len(load_rollouts("a")) == 2
-    code, words = told("simulate", run, *command, 2, "--goals", "tree")
+    code, words = told("simulate", *again, 2, "--goals", "tree")
     assert (code, "differs in settings.goals" in words) == (1, True)
 
 

@@ -69,7 +69,7 @@ class About:
         if planner:
             agent, drivers = f"{planner} among {agent}", {"ego": planner, **drivers}
         plain = json.loads(json.dumps(settings, default=str))  # as it is read back, to be compared
-        return cls(agent, seed, drivers, plain, {"path": str(store.path), "checksum": store.checksum()})
+        return cls(agent, seed, drivers, plain, {"path": str(store.path.resolve()), "checksum": store.checksum()})
 
 
 @dataclass(frozen=True)
