@@ -67,9 +67,8 @@ def lane(lane_id: int, y: float, begin: float, end: float, width: float = 3.6, *
 
 
 def city() -> dict[str, Any]:
-    """Lanes 10 → 11 at y = 0 and 20 → 21 at y = 3.6 along +x, 30 at y = 7.2 along -x, bike lane 40 at y = -3.
-
-    The map ends at x = 0 and x = 120, both edges of tiles; lane 11 goes on into lane 12, which is not there.
+    """Lanes 10 → 11 at y = 0 and 20 → 21 at y = 3.6 along +x, 30 at y = 7.2 along -x, bike lane 40 at y = -3. The map
+    ends at x = 0 and x = 120, both edges of tiles; lane 11 goes on into lane 12, which is not there.
     """
     dashed = {"left_lane_mark_type": "DASHED_WHITE"}
     lanes = [

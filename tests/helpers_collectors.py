@@ -117,7 +117,6 @@ def hashed(td: TensorDictBase) -> TensorDictBase:
 
 class Mass(EnvBase):
     """Points x' = x + 0.5 (v + action), whose episode is over beyond a limit; they can come back in, if not sticky.
-
     There is one point, or several agents, which end separately.
     """
 

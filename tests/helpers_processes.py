@@ -47,9 +47,8 @@ def serve_from_here() -> None:
 
 
 def apart(function: Callable[..., Any], *given: Any, said: Path | None = None) -> BaseProcess:
-    """Start a function of a module, whose result is the exit status (``None`` for 0); arguments are pickled. On Linux
-    its process is forked from one without threads. What it prints comes into a file, errors into one that ends on
-    ``.err``.
+    """Start a function of a module, whose result is the exit status (``None`` for 0), on Linux forked from a process
+    without threads; arguments are pickled. What it prints comes into a file, errors into one that ends on ``.err``.
     """
     process = multiprocessing.get_context(engine._START).Process(target=_run, args=(function, given, said))
     process.start()

@@ -61,10 +61,9 @@ def moved_road(road, degrees, shift):
 
 
 def crossing():
-    """Four-way crossing, traffic on the right. Arm k lies at k * 90 degrees from south, counter-clockwise.
-
-    Lanes in0 ... in3 lead in, out0 ... out3 lead out, left/ahead/right k are the connectors of in k. Lanes lie 2 m
-    right of the middle of the road, arms are 60 m long, and the connectors begin 10 m from the centre.
+    """Four-way crossing, traffic on the right. Arm k lies at k * 90 degrees from south, counter-clockwise. Lanes in0
+    ... in3 lead in, out0 ... out3 lead out, left/ahead/right k are the connectors of in k. Lanes lie 2 m right of the
+    middle of the road, arms are 60 m long, and the connectors begin 10 m from the centre.
     """
     lines, edges = {}, []
     # Seen from the south arm, driving north along x = 2.

@@ -40,9 +40,8 @@ def track(x: float, y: float, speed: float, kind="VEHICLE", first=0, size=(4.5, 
 
 
 def scenario() -> dict[str, Any]:
-    """Two lanes of 40 m side by side, a connector of 20 m after one of them, and one after that.
-
-    The recording vehicle drives in the right lane; a cone, a walker and a late car are there too.
+    """Two lanes of 40 m side by side, a connector of 20 m after one of them, and one after that. The recording
+    vehicle drives in the right lane; a cone, a walker and a late car are there too.
     """
     lane, white = {"type": "LANE_SURFACE_STREET"}, {"type": "ROAD_LINE_SOLID_SINGLE_WHITE"}
     outline = (0, -2), (0, 6), (80, 6), (80, -2), (0, -2)

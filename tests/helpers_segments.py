@@ -131,9 +131,8 @@ def straight_road(num_agents=3, steps=51, dt=0.2, seed=0, num_lanes=3, **changes
 
 
 def crossing_road(arm: float = 120.0) -> RoadMap:
-    """Four arms with one lane each way (right-hand traffic), arms 0-3 to the south, east, north, west.
-
-    Lanes: 0-3 approaches, 4-7 exits, then per approach k: 8 + 3k straight, 9 + 3k left, 10 + 3k right.
+    """Four arms with one lane each way (right-hand traffic), arms 0-3 to the south, east, north, west. Lanes: 0-3
+    approaches, 4-7 exits, then per approach k: 8 + 3k straight, 9 + 3k left, 10 + 3k right.
     """
     half, box = LANE_WIDTH / 2, 12.0
     down = np.arange(-arm, -box + 1, 2.0)

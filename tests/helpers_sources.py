@@ -58,10 +58,9 @@ def womd_points(target: Iterable[object], line: Iterable[tuple[float, float]]) -
 
 
 def womd_scenario(name: str = "0123456789abcdef", tracks: int = 3, steps: int = 5) -> pb.Scenario:
-    """Cars on two lanes side by side, each with a successor; one light, one of everything else.
-
-    Lane 10 runs along y = 0 into 11; lane 20 along y = 4 into 21. Track k has id 100 + k, lane k modulo 2,
-    speed 10 + k and starts at x = 5 k; the last track is the recording vehicle.
+    """Cars on two lanes side by side, each with a successor; one light, one of everything else. Lane 10 runs along y
+    = 0 into 11; lane 20 along y = 4 into 21. Track k has id 100 + k, lane k modulo 2, speed 10 + k and starts at x =
+    5 k; the last track is the recording vehicle.
     """
     scenario = pb.Scenario(scenario_id=name, current_time_index=1, sdc_track_index=tracks - 1)
     scenario.timestamps_seconds.extend(0.1 * k + 1e-5 * (k % 3) for k in range(steps))

@@ -79,6 +79,7 @@ def test_an_ego_may_enter_late_and_leave_early(tmp_path: Path) -> None:
     np.testing.assert_allclose(x, np.arange(30, 101), atol=1e-4)
     alone = segments(public(tmp_path, [*track(9, steps=range(100)), *track(3, steps=range(140, 201))]))
     assert [one.num_steps for one in alone] == [100, 61]
+    assert read_one("interaction", public(tmp_path, track(3, steps=[*range(71), *range(90, 101)]))).num_steps == 71
     short = public(tmp_path, [*track(3, steps=range(55, 120)), *parked])
     assert "no moving vehicle is observed at every step" in read_error("interaction", short).message
 
@@ -107,6 +108,16 @@ def test_cases_of_the_newer_layout(tmp_path: Path) -> None:
         assert (segment.predict.tolist(), segment.interest.tolist()) == ([1], [0])
         assert segment.agent_type[0] == AgentType.PEDESTRIAN
         np.testing.assert_allclose(segment.position[1, 0] + segment.origin, (x + 1, 2, 0), atol=1e-4)
+
+
+def test_recordings_beside_their_own_maps_differ_by_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "map.osm_xy").write_text(osm())
+        (tmp_path / name / "vehicle_tracks_000.csv").write_text(text(CARS))
+    monkeypatch.chdir(public(tmp_path).parent)
+    files = [Path("../..", name, "vehicle_tracks_000.csv") for name in ("a", "b", "recorded_trackfiles/DR_X")]
+    assert [read_one("interaction", file).group for file in files] == ["a_map_000", "b_map_000", "DR_X_000"]
 
 
 def test_cases_are_not_put_on_the_map_of_another_place(tmp_path: Path) -> None:

@@ -180,14 +180,14 @@ def test_only_the_light_of_the_own_lane_counts(speed, phase, dt, aside, ahead) -
 @pytest.mark.parametrize("lane", [2.0, 30.0])
 def test_who_stops_behind_a_red_stop_point_has_run_it(length, before, past, lane) -> None:
     """However long it is, and its lane, and however far ``before`` the lane the stop point lies."""
-    ends = [-100.0, before, before + lane, 300.0]
-    road = make_road([[(a, 0.0), (b, 0.0)] for a, b in pairwise(ends)], [(0, 1), (1, 2)])
+    ends = [(x, 0.0) for x in (-100.0, before, before + lane, 300.0)]
+    road = make_road([*map(list, pairwise(ends))], [(0, 1), (1, 2)])
     x = np.minimum(-40.0 + 0.8 * np.arange(70), past - length / 2)
     lights: dict[str, Any] = {"signal_lane": np.array([1], np.int32), "signal_point": np.zeros((1, 3), np.float32)}
     lights["signal_state"] = np.full((1, len(x)), SignalState.STOP, np.uint8)
-    how: Any = lights | {"size": np.array([[length, 2.0, 1.6]], np.float32)}
+    lights["size"] = np.array([[length, 2.0, 1.6]], np.float32)
     place, speed = np.stack([x, 0 * x], -1)[None], np.tile([8.0, 0.0], (1, len(x), 1))
-    segment = make_segment(road, place, np.zeros((1, len(x))), speed, 0.1, **how)
+    segment = make_segment(road, place, np.zeros((1, len(x))), speed, 0.1, **lights)
     found = red_lights(world_of(played(segment), 0), np.array([0]), Lanes(segment), 0)
     assert len(found.light) == (past > 0)
 

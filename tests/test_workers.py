@@ -154,8 +154,7 @@ def test_a_worker_that_dies_names_the_segments_at_hand(store: SegmentStore) -> N
 def test_what_a_file_defines_is_sent_by_its_path(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text("class Own:\n    size = 3\n\ndef made(items):\n    return Own().size\n")
     made = load_object(f"{tmp_path}/own.py:made")
-    found = shared(made, [[0], [1]], EvaluateConfig(workers=2))
-    assert list(found) == [3, 3]
+    assert list(shared(made, [[0], [1]], EvaluateConfig(workers=2))) == [3, 3]
 
 
 def test_what_cannot_be_sent_is_refused(store: SegmentStore) -> None:

@@ -31,10 +31,8 @@ SMALL = 1 << 20
 
 
 class Target(NamedTuple):
-    """One thing that reads files.
-
-    ``good`` gives its files by name, the first of which is opened; ``mutate`` changes some; ``run`` reads them from a
-    folder and says what came of it and what is wrong, or raises whatever it raises.
+    """One thing that reads files. ``good`` gives its files by name, the first of which is opened; ``mutate`` changes
+    some; ``run`` reads them from a folder and says what came of it and what is wrong, or raises whatever it raises.
     """
 
     good: Callable[[], Files]

@@ -61,13 +61,11 @@ def best_of(last: Path) -> Best | None:
 
 
 def choose(folder: Path, which: str = "") -> Path:
-    """Return the checkpoint of a run that ``which`` names.
+    """Return the checkpoint of a run that ``which`` names: the ``best``, the ``last``, or that of a step such as
+    ``3000`` or ``step-3000``; by default the best, which the last one knows, if the run was validated, else the last.
 
-    The last one knows which is the best, so that there is no second record to fall out of step with it.
-
-    It is the ``best``, the ``last``, or that of a step such as ``3000`` or ``step-3000``; by default the best if the
-    run was validated, else the last. Raises a :class:`ConfigError` if there is no such checkpoint, a
-    :class:`CheckpointError` if the last one can't be read.
+    Raises a :class:`ConfigError` if there is no such checkpoint, a :class:`CheckpointError` if the last one can't be
+    read.
     """
     from symphony.agents.checkpoint import CheckpointError, checkpoints  # noqa: PLC0415
 

@@ -23,7 +23,7 @@ EVEN = 0.1  # share of a time step by which a frame may come early or late witho
 MAX_GAP = 1.0  # seconds between two frames of a log that are filled in between; a longer gap stays open
 SLOW, FAST = 1.0, 2.0  # m/s between which the heading goes over from the logged one to that of the motion
 
-LOST = "frames lost in the recording, filled in between"
+LOST = "frames lost in the recording, up to 1 s of them filled in between"
 UNEVEN = "frames at uneven times, brought to even ones"
 REPEATED = "frames left out: not after those before them"
 
@@ -88,9 +88,8 @@ def evened(segment: RunSegment, times: Doubles) -> RunSegment:
 
     Frames within a tenth of a step are taken as they are. What lies between two frames is interpolated as in
     :func:`resample`; inside a gap of more than :data:`MAX_GAP` seconds no agent is valid. Frames that do not come
-    after those before them are left out. What was done is noted (see :mod:`symphony.data.odd`).
-
-    Takes the times [T] of its steps in seconds; its ``dt`` is the usual time between two frames.
+    after those before them are left out. What was done is noted (see :mod:`symphony.data.odd`). Times [T] are those
+    of its steps in seconds; its ``dt`` is the usual time between two frames.
     """
     dt = segment.dt
     if (np.abs(np.diff(times) - dt) <= EVEN * dt).all():

@@ -29,10 +29,8 @@ def lane_of(
     tolerance: float = LATERAL,
     keep: Callable[[Near], Bools] | None = None,
 ) -> Indices:
-    """Return the lane of each vehicle, -1 where there is none.
-
-    It is the nearest centre line that points the same way within :data:`LANE_TURN`. Lanes within a quarter of a
-    metre of the nearest are told apart by heading, then by index.
+    """Return the lane of each vehicle, -1 where there is none: the nearest centre line that points the same way, by
+    :data:`LANE_TURN`; those within a quarter of a metre of the nearest are told apart by heading, then by index.
 
     Takes positions [..., 2] and headings [...], the largest distance from the centre line in metres, and a function
     of which pairs of a vehicle and a lane near it count, where not all do. Raises ValueError for a position or

@@ -23,6 +23,7 @@ names is better than the end of a KML lane.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -134,8 +135,10 @@ class InteractionReader(Reader):
             for at, end in self._windows(steps, dt) if files.single else [(0, steps)]:
                 window = first + at, first + end
                 what = f"t{round(at * dt, 3):g}" if files.single else f"case{case}"
-                name = f"{files.map.stem}_{files.part}_{what}"
-                begin, stop = _observed(mine.between(*window), *window) if files.single else window
+                # A map of another name than its folder's, which other recordings may have, too.
+                place = [files.tracks.parent.name, files.map.stem][not files.single :]
+                name = "_".join([*dict.fromkeys(place), files.part, what])
+                begin, stop = _observed(mine.between(*window), *window, dt) if files.single else window
                 try:
                     yield from self._window(mine.between(begin, stop), scene, name, begin, stop - begin)
                 except DataError as error:
@@ -191,13 +194,14 @@ class InteractionReader(Reader):
         yield from base.by_ego(segment, candidates, self.egos)
 
 
-def _observed(rows: Rows, begin: int, stop: int) -> tuple[int, int]:
+def _observed(rows: Rows, begin: int, stop: int, dt: float) -> tuple[int, int]:
     """Return the window, or its longest part, at least half of it, in which one vehicle that moves is always seen."""
     times, step = np.unique(rows.time, return_inverse=True)  # at others the frame may be lost
     best = times[:0]
     for track in np.unique(rows.track[rows.kind == AgentType.VEHICLE]):
         mine = np.flatnonzero(rows.track == track)
-        for part in np.split(mine, np.flatnonzero(np.diff(step[mine]) != 1) + 1):
+        unseen = (np.diff(step[mine]) != 1) | (np.diff(rows.time[mine]) * dt > MAX_GAP + 1e-6)
+        for part in np.split(mine, np.flatnonzero(unseen) + 1):
             moves = np.linalg.norm(rows.state[part, :2] - rows.state[part[0], :2], axis=-1).max() > base.MOVING
             best = times[step[part]] if moves and len(part) > len(best) else best
     whole = not len(best) or 2 * (best[-1] - best[0]) < stop - begin - 1
@@ -280,6 +284,7 @@ class Files:
 
 def find_files(path: Path) -> Files:
     """Return the files that a file of tracks is read with; a :class:`DataError` for an odd name or a missing map."""
+    path = Path(os.path.abspath(path))  # from which one can climb; links stay
     numbered, split = _NUMBERED.fullmatch(path.name), _SPLIT.fullmatch(path.name)
     if numbered is None:
         if split is None:
@@ -291,7 +296,7 @@ def find_files(path: Path) -> Files:
     beside = [folder / name if (folder / name).is_file() else None for name in names]
     topology = sorted(folder.glob("*_map.kml"))
     beside.append(topology[0] if len(topology) == 1 else None)
-    return Files(path, part, _map(path, folder.resolve().name, alone=True), True, *beside)
+    return Files(path, part, _map(path, folder.name, alone=True), True, *beside)
 
 
 def _map(path: Path, scene: str, *, alone: bool) -> Path:
