@@ -180,8 +180,7 @@ def test_only_the_light_of_the_own_lane_counts(speed, phase, dt, aside, ahead) -
 @pytest.mark.parametrize("lane", [2.0, 30.0])
 def test_who_stops_behind_a_red_stop_point_has_run_it(length, before, past, lane) -> None:
     """However long it is, and its lane, and however far ``before`` the lane the stop point lies."""
-    ends = [(x, 0.0) for x in (-100.0, before, before + lane, 300.0)]
-    road = make_road([*map(list, pairwise(ends))], [(0, 1), (1, 2)])
+    road = make_road([[(a, 0), (b, 0)] for a, b in pairwise((-100, before, before + lane, 300))], [(0, 1), (1, 2)])
     x = np.minimum(-40.0 + 0.8 * np.arange(70), past - length / 2)
     lights: dict[str, Any] = {"signal_lane": np.array([1], np.int32), "signal_point": np.zeros((1, 3), np.float32)}
     lights["signal_state"] = np.full((1, len(x)), SignalState.STOP, np.uint8)
@@ -190,6 +189,21 @@ def test_who_stops_behind_a_red_stop_point_has_run_it(length, before, past, lane
     segment = make_segment(road, place, np.zeros((1, len(x))), speed, 0.1, **lights)
     found = red_lights(world_of(played(segment), 0), np.array([0]), Lanes(segment), 0)
     assert len(found.light) == (past > 0)
+
+
+@pytest.mark.parametrize("lane", [0, 1])
+def test_what_happens_again_counts_again(lane) -> None:
+    half = 20 * np.stack([np.cos(angle := np.linspace(0, np.pi, 60)), np.sin(angle)], -1)
+    road = make_road([half, -half], [(0, 1), (1, 0)])
+    turn = -0.5 + 0.08 * np.arange(231)  # three times past 0, where the light of either lane is
+    place, way = (np.stack([np.cos(turn + t), np.sin(turn + t)], -1)[None] for t in (0, np.pi / 2))
+    lights: dict[str, Any] = {"signal_lane": np.array([lane], np.int32), "signal_point": np.float32([[20, 0, 0]])}
+    lights["signal_state"] = np.full((1, len(turn)), SignalState.STOP, np.uint8)
+    segment = make_segment(road, 20 * place, turn[None] + np.pi / 2, 8 * way, 0.2, **lights)
+    assert red_lights(world_of(played(segment), 0), np.array([0]), Lanes(segment), 0).light.tolist() == [0, 0, 0]
+    saved = played(driving((0, 0, 0, 12), (10, 0, 0, 7)))
+    saved.counted[0, 8:10, 0] = False  # while the boxes overlap
+    assert rows(saved)[0]["collisions"] == 2
 
 
 def test_where_a_map_has_no_edge_or_light_nothing_is_said_of_them() -> None:

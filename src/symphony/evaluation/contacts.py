@@ -56,9 +56,8 @@ class Contacts(NamedTuple):
 
 
 def contacts(worlds: Sequence[World], evaluated: Indices) -> list[Contacts]:
-    """Return the collisions of evaluated agents [M] in each of some rollouts of one segment.
-
-    The first states do not count, and agents on different levels never meet.
+    """Return the collisions of evaluated agents [M] in each of some rollouts of one segment. The first states do not
+    count, and agents on different levels never meet.
     """
 
     def stacked(name: str) -> torch.Tensor:
@@ -74,18 +73,20 @@ def contacts(worlds: Sequence[World], evaluated: Indices) -> list[Contacts]:
 
 
 def _first(world: World, agent: Indices, other: Indices, step: Indices, share: Reals) -> Contacts:
-    """Return of the contacts of each pair the first, in order of time."""
+    """Return of the contacts of each pair the first, in order of time; an agent that comes back meets anew."""
     boxes = [
         from_numpy(part)
         for row in (agent, other)
         for part in (world.position[row, step], world.heading[row, step], world.size[row])
     ]
     order = np.lexsort((other, agent, share, step))
-    pair = (agent * len(world.size) + other)[order]
+    stay = (world.valid[:, 1:] & ~world.valid[:, :-1]).cumsum(1)[agent, step - 1]
+    pair = ((agent * len(world.size) + other) * world.valid.shape[1] + stay)[order]
     _, first, number = np.unique(pair, return_index=True, return_inverse=True)
     at_state = np.bincount(number, boxes_overlap(*boxes).numpy()[order], len(first)) > 0
     turn = np.argsort(first)
-    agent, other, step, share = (part[order[first[turn]]] for part in (agent, other, step, share))
+    order = order[first[turn]]
+    agent, other, step, share = agent[order], other[order], step[order], share[order]
     poses = pose_ends(world, agent, other, step), pose_ends(world, other, agent, step)
     sizes = (from_numpy(world.size[row]) for row in (agent, other))
     kind = kind_of_contact(*poses, from_numpy(share), *sizes)
@@ -93,9 +94,8 @@ def _first(world: World, agent: Indices, other: Indices, step: Indices, share: R
 
 
 def pose_ends(world: World, row: Indices, other: Indices, step: Indices) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return poses [E, 5] (x, y, heading, velocity x, velocity y) of agents before and after the step of a contact.
-
-    Where one of the two was not there before the step, both are those after it.
+    """Return poses [E, 5] (x, y, heading, velocity x, velocity y) of agents before and after the step of a contact;
+    both are those after it where one of the two was not there before.
     """
     seen = world.valid[row, step - 1] & world.valid[other, step - 1]
     poses = np.concatenate([world.position, world.heading[..., None], world.velocity], -1)

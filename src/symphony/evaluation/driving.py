@@ -128,19 +128,21 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
     found = []
     # There are few crossings.
     for m, t in zip(*(part.tolist() for part in passing.any(-1).nonzero()), strict=True):
-        best, least = -1, math.inf
+        best, least, agent = -1, math.inf, evaluated[m]
+        # Where it was without a break, away from the stop point.
+        gone = np.flatnonzero(~world.valid[agent])
+        first, last = gone[gone <= t].max(initial=-1) + 1, gone[gone > t].min(initial=world.valid.shape[1])
+        behind, ahead = world.position[agent, first : t + 1][::-1], world.position[agent, t + 1 : last]
         # Lanes that part here differ in direction, so that one front may cross their stop points in different steps.
         beside = np.linalg.norm(stop - stop[passing[m, t].argmax()], axis=-1) < _PASSED
         for light in (passing[m].any(0) & beside).nonzero()[0]:
-            at_end = along_lane[light] > 0.5 * length[light]
-            part = slice(0, t + 1) if at_end else slice(t + 1, None)
-            path = world.position[evaluated[m], part][world.valid[evaluated[m], part]]
+            path = behind if along_lane[light] > 0.5 * length[light] else ahead
             way = shapely.linestrings(np.concatenate([path[:1], path]))  # which may have no length
-            points = shapely.line_interpolate_point(way, np.arange(way.length + 1))
+            points = shapely.line_interpolate_point(way, np.arange(min(way.length, length[light]) + 1))
             off = shapely.distance(points, shapely.points(stop[light]))
-            # A step may be longer than the lane, and so may an agent, whose centre is still before it.
+            # It may come by here again. A step may be longer than the lane, and an agent, whose centre is before it.
             points, line = points[off <= max(length[light], off.min())], graph.lines[lane[light]]
-            reach = 0.5 * world.size[evaluated[m], 0] + np.linalg.norm(stop[light] - line[0])
+            reach = 0.5 * world.size[agent, 0] + np.linalg.norm(stop[light] - line[0])
             before = line[:1] + reach * (line[0] - line[1]) / np.linalg.norm(line[0] - line[1])
             longer = shapely.linestrings(np.concatenate([before, line]))
             distance = float(shapely.distance(lines[light], points).mean())
@@ -149,7 +151,7 @@ def red_lights(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Li
         # One that changes just then is not held against the agent.
         shown = segment.signal_state[known[best], start + t : start + t + 2]
         if best >= 0 and passing[m, t, best] and np.isin(shown, RED).all():
-            found.append((int(evaluated[m]), t + 1, int(known[best])))
+            found.append((int(agent), t + 1, int(known[best])))
     return Lights(*np.array(found, np.int64).reshape(-1, 3).T)
 
 
@@ -168,11 +170,9 @@ def wrong_way(world: World, evaluated: Indices, lanes: Lanes) -> Bools:
 
 
 def blocking(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Bools:
-    """Return [M, U] when evaluated agents block traffic.
-
-    That is, they stand (:data:`symphony.metrics.kinds.STANDING`) in a lane that goes on, for :data:`SECONDS` or more,
-    while nobody is in their way ahead or crosses it, no light ahead is other than green, and the log, where it has
-    the agent, moves. All this is on their level.
+    """Return [M, U] when evaluated agents block traffic: stand (:data:`symphony.metrics.kinds.STANDING`) in a lane
+    that goes on, for :data:`SECONDS` or more, while nobody is in their way ahead or crosses it, no light ahead is
+    other than green, and the log, where it has the agent, moves. All this is on their level.
     """
     segment = lanes.segment
     within = slice(start, start + world.valid.shape[1])
