@@ -74,7 +74,7 @@ class DrivingEnv(EnvBase):
         observation: what the agents observe.
         reward: reward ``[*b, N]`` of a step, from the state before it (with its action) and the state after it; by
             default -1 for an agent that collides or is off the road.
-        ends_on: what ends the episode of a scene, for any of its interactive agents.
+        ends_on: what ends the episode of a scene, after a step, for any of its interactive agents.
         after_collision: what becomes of interactive agents whose boxes overlap another: they ``go-on``, ``stop`` for
             as long as they overlap, are gone from the next step on (``remove``), or until there is room where they
             began (``respawn``); the last two in open traffic only.

@@ -143,9 +143,9 @@ class SceneDataset:
         self.dynamics = Bicycle() if dynamics is None else dynamics
         self.indices = list(range(len(store))) if indices is None else list(indices)
         self.routes, self.duration, self.keep, self.few_shapes = routes, duration, keep, few_shapes
-        made, names = (lambda items: [self._scene(i) for i in items]), tuple(SceneBatch.__annotations__)
-        size = lambda found: sum(getattr(found, name).nbytes for name in names)  # noqa: E731
-        self.scene = ItemCache(made, size, keep=keep, name="prepared run segments")
+        self.scene = ItemCache(
+            lambda items: [self._scene(i) for i in items], SceneBatch.bytes, keep=keep, name="prepared run segments"
+        )
         self.experts = ItemCache(self.fit, attrgetter("nbytes"), keep=keep, name="demonstrations")
         self.kept = KeptExperts(store.path, f"{self.dynamics} {duration} {routes}")
         self._graph = lru_cache(GRAPHS)(lambda number: LaneGraph(store.road(number)))

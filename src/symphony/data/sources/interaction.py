@@ -135,8 +135,8 @@ class InteractionReader(Reader):
             for at, end in self._windows(steps, dt) if files.single else [(0, steps)]:
                 window = first + at, first + end
                 what = f"t{round(at * dt, 3):g}" if files.single else f"case{case}"
-                # A map of another name than its folder's, which other recordings may have, too.
-                place = [files.tracks.parent.name, files.map.stem][not files.single :]
+                # A map may have another name than the folder, which those of other recordings have, too.
+                place = [files.tracks.parent.name] * files.single + [files.map.stem]
                 name = "_".join([*dict.fromkeys(place), files.part, what])
                 begin, stop = _observed(mine.between(*window), *window, dt) if files.single else window
                 try:
