@@ -104,14 +104,14 @@ def test_bounds_of_rates_hold_as_often_as_they_say(rate: float, alike: float, si
 
 @given(st.integers(2, 30), st.sampled_from([0.9, 0.95]))
 def test_means_have_students_bounds(count: int, confidence: float) -> None:
-    values = np.random.default_rng(count).normal(size=count)
+    values, more = (np.random.default_rng(count).normal(size=n) for n in (count, 21 * count))
     found = estimate(values.tolist(), [str(k) for k in range(count)], confidence)
     spread = t_quantile(confidence, count - 1) * values.std(ddof=1) / np.sqrt(count)
     assert (found.low, found.high) == pytest.approx((values.mean() - spread, values.mean() + spread))
     # One group that is nearly all of it is hardly more than one.
     names = ["a"] * (20 * count) + [str(k) for k in range(count)]
-    more, even = np.resize(values, 21 * count).tolist(), [str(k % (count + 1)) for k in range(21 * count)]
-    wide, few = (estimate(more, each, confidence) for each in (names, even))
+    even = [str(k % (count + 1)) for k in range(21 * count)]
+    wide, few = (estimate(more.tolist(), each, confidence) for each in (names, even))
     assert wide.high - wide.mean > few.high - few.mean
 
 
@@ -119,8 +119,10 @@ def test_means_have_students_bounds(count: int, confidence: float) -> None:
 def test_of_planners_that_did_nothing_wrong_no_difference_is_known_to_be_none(count: int, confidence: float) -> None:
     names = [str(k) for k in range(count)]
     rate = estimate([0.0] * count, names, confidence, "rate")
-    found = estimate([0.0] * count, names, confidence, "difference of rates")
-    assert found.high == -found.low == pytest.approx(rate.high)
+    for kind in ("difference of rates", "share"):
+        found = estimate([0.0] * count, names, confidence, kind)
+        assert found.high == -found.low == pytest.approx(rate.high)
+    assert estimate([0.1] * count, names, confidence).high is None
 
 
 @given(st.floats(0.1, 60), st.sampled_from([0.8, 0.95, 0.99]))

@@ -31,9 +31,12 @@ from symphony.envs.objects import Objects, Observers, objects_at, rollout_height
 from symphony.envs.observation import nearest_points, observed_points
 from symphony.envs.scene import PointType, Tables
 from symphony.evaluation import evaluate
+from symphony.evaluation.contacts import contacts
 from symphony.geometry import LEVEL, NO_BOUNDARY, levels_apart
 from symphony.geometry.cells import PointCells
 from symphony.geometry.nearest import nearest, smallest
+from symphony.render.plots import draw_hit, saved_clip
+from symphony.render.style import new_figure
 from symphony.saved.rollouts import world_of
 from test_geometry import closed, segments, star
 
@@ -408,6 +411,19 @@ def test_points_and_edges_are_those_of_ones_own_level(count: int) -> None:
             seen = set(flat[k, agent][mask[k, agent]].tolist())
             away = (scenes.point[0, mine] - where[k, agent]).square().sum(-1)
             assert seen == set(mine[away.argsort(stable=True)[:count]].tolist())
+
+
+def test_who_stands_above_is_not_drawn_as_hit() -> None:
+    """The ego's log ends before the bridge; simulated, it drives on and is hit below by the driven agent 2."""
+    full = overpass(HIGH)
+    state = played(full, [0, 2]).state.copy()
+    state[:, 18:, 1, 0] += 11
+    there = np.ones((1, STEPS - 1, 2), bool)
+    saved = played(hide(full, 0, slice(15, STEPS)), [0, 2], state=state, counted=there)
+    saved.collision[0, 17:] = True
+    (hits,) = contacts([world_of(saved, 0)], np.array([0, 2]))
+    assert list(zip(hits.agent.tolist(), hits.other.tolist(), strict=True)) == [(0, 2), (2, 0)]
+    assert draw_hit(new_figure(4, 4).add_subplot(), saved_clip(saved)) is None
 
 
 def test_a_device_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

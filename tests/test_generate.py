@@ -439,15 +439,22 @@ def test_lanes_lie_where_opendrive_has_them(tmp_path: Path) -> None:
 
 
 @needs_sumo
-@pytest.mark.parametrize("limit", ['max="no limit"', 'max="undefined"', 'max="30" unit="mph"'])
-def test_a_straight_road_is_seen_from_its_middle_whatever_its_limit_says(tmp_path: Path, limit: str) -> None:
+@pytest.mark.parametrize(("limit", "speeds"), [
+    ('max="no limit"', {50}), ('max="undefined"', {50}), ('max="30" unit="mph"', {48}),
+    ('max="80"/></type><type s="60"><speed max="30" unit="mph"/></type><type s="200"><speed max="25"', {288, 48, 90}),
+])  # fmt: skip
+def test_a_straight_road_is_seen_from_its_middle_whatever_its_limit_says(
+    tmp_path: Path, limit: str, speeds: set[int]
+) -> None:
     lanes = f'<center><lane id="0" type="none"/></center><right>{LANE.format(-1, 3, "")}</right>'
     text = XODR.format(pieces='<geometry s="0" x="0" y="0" hdg="0" length="250"><line/></geometry>', lanes=lanes)
     file = tmp_path / "straight.xodr"
     file.write_text(text.replace('max="30" unit="mph"', limit))
     network = read_network(own_network(file, tmp_path))
+    limits = zip(network.speed, network.internal, strict=True)
+    assert {round(3.6 * limit) for limit, inside in limits if not inside} == speeds
     ends = np.concatenate([line[[0, -1]] for line in network.lanes])
-    assert np.linalg.norm(np.array(network.centers)[:, None] - ends, axis=-1).min() > 50
+    assert np.linalg.norm(np.array(network.centers)[:, None] - ends, axis=-1).min() > 20
 
 
 OSM = """<osm version="0.6">

@@ -9,7 +9,6 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +30,12 @@ from helpers_table import make_record, make_run
 from symphony.cli import main
 from symphony.data.segment import MarkType, Polylines, RunSegment, SignalState
 from symphony.errors import ConfigError
-from symphony.render import Clip, animate_rollouts, plot_curves, plot_grid, plot_rollout, plot_segment, viewer
+from symphony.render import Clip, animate_rollouts, plot_curves, plot_rollout, plot_segment, viewer
 from symphony.render.curves import read_curves, smoothed
 from symphony.render.plots import colors_of, saved_clip
 from symphony.render.roads import CORNERS, NOSE, SIGNALS, lane_arrows, pieces, place, road_ribbon
 from symphony.render.style import AGENT_COLORS, INK, PLAYBACK, ROAD, new_figure, view_around
-from symphony.render.video import _Panel, frames_of
+from symphony.render.video import _Panel
 
 
 def blank() -> Axes:
@@ -336,20 +335,6 @@ def test_agents_have_their_colours_in_pictures_and_pages() -> None:
     assert "and 22 more in colour" in labels(axes)
 
 
-def test_panels_of_a_grid_are_of_one_size_however_far_rollouts_go(tmp_path: Path) -> None:
-    clips = []
-    for seed, scale in enumerate((1.0, 4.0, 9.0, 2.0)):
-        clip = rollouts(straight_road(4, seed=seed, steps=12), [0], 1)
-        clip.position = clip.position[:, :, :1] + scale * (clip.position - clip.position[:, :, :1])
-        clips.append(clip)
-    figure = plot_grid([partial(plot_rollout, clip) for clip in clips], tmp_path / "a.png", columns=3)
-    assert {axes.get_subplotspec().rowspan.start for axes in figure.axes} == {0, 1}
-    sizes = [axes.get_window_extent().size for axes in figure.axes]
-    np.testing.assert_allclose(sizes, [sizes[0]] * 4, atol=0.5)
-    frames, _ = frames_of(clips[:2])
-    assert len({frame.shape for frame in frames}) == 1
-
-
 def test_pictures_need_no_window_and_no_torch() -> None:
     code = "import sys, symphony.render.video; assert not {'matplotlib.pyplot', 'torch'} & {*sys.modules}"
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -474,6 +459,8 @@ def test_missing_and_odd_values_are_tolerated(tmp_path: Path) -> None:
     assert list(curves) == ["auc", "late"]
     np.testing.assert_array_equal(curves["auc"], [[1, 2, 3], [nan, nan, 0.5]])
     assert plot_curves({"odd": odd}, tmp_path / "odd.svg").axes[0].lines[1].get_marker() == "o"
+    many = {"many": records(ttc_p5=1.0, ttc_p25=2.0, ttc_p50=3.0, ttc_p75=4.0)}
+    assert len(plot_curves(many, tmp_path / "many.svg").axes[0].lines) == 8
 
 
 @settings(deadline=None, max_examples=25)

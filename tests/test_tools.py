@@ -29,7 +29,7 @@ if LINUX:
 
 HERE = Path(__file__).parent
 INPUTS = 8
-NAMES = [*readers(), "test_area", "store", "checkpoint", "configuration", "submission", "rollouts"]
+NAMES = [*readers(), "test_area", "store", "checkpoint", "submission", "rollouts"]
 
 
 def skip_without_its_package(name: str) -> None:

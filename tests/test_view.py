@@ -23,11 +23,12 @@ from PIL import Image
 from helpers_saved import played, random_trees, searched
 from helpers_segments import crossing, hide, random_segment, straight_road
 from symphony.cli import main
+from symphony.cli.rollouts import places
 from symphony.errors import DataError
 from symphony.evaluation.report import Report, add_segment
 from symphony.render.viewer import Event, Replay, packed, view_page
 from symphony.render.viewer.pack import packed_log
-from symphony.saved.folder import About, save_rollouts
+from symphony.saved.folder import About, load_rollouts, save_rollouts
 from symphony.saved.rollouts import SavedRollouts
 
 ABOUT = About("made </script><b>\udce9")
@@ -124,6 +125,10 @@ def test_the_page_holds_all_segments_and_loads_nothing(tmp_path: Path) -> None:
     assert [unpacked(block)[0]["id"] for block in blocks(page)] == [s.segment.segment_id for s in found]
     about = re.search(r'<script type="application/json" id="about">(.*?)</script>', page)
     assert json.loads(about[1])["names"] == [ABOUT.agent]
+    # Of several folders the ends of their paths tell them apart.
+    shutil.copytree(tmp_path / "sim", tmp_path / "b" / "sim")
+    folders = [load_rollouts(tmp_path / name) for name in ("sim", "b/sim", "b/../sim")]
+    assert places(folders) == [f"{where}/sim: " for where in (tmp_path.name, "b", tmp_path.name)]
     assert "http" not in re.sub(r'id="segment-\d+">[^<]*', "", page)
     assert not re.search(r"\b(src|href)\s*=|@import|url\(|fetch\(|XMLHttpRequest|import\(", page)
     assert "/*" not in re.sub(r"/\*.*?\*/", "", page, flags=re.S)

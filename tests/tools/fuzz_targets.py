@@ -32,7 +32,6 @@ from helpers_wosac import META, record_rollouts, womd_record
 from symphony.agents.checkpoint import MANIFEST, checkpoints, load_checkpoint, save_checkpoint
 from symphony.agents.choice import Best
 from symphony.cli.rollouts import write_view
-from symphony.config import AgentSpec, DiscriminatorConfig, TrainConfig, read_json, to_json
 from symphony.data.convert import Preparation, info
 from symphony.data.segment import RunSegment
 from symphony.data.selection import choices
@@ -41,7 +40,7 @@ from symphony.data.sources.base import UnexpectedError
 from symphony.data.sources.womd import read_records
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
-from symphony.errors import ConfigError, DataError
+from symphony.errors import DataError
 from symphony.evaluation.report import report
 from symphony.learning.demonstrations import SceneDataset
 from symphony.saved import folder as saved_folder
@@ -304,23 +303,6 @@ def _load_checkpoint(folder: Path, _: str) -> tuple[str, str]:
     return ACCEPTED, ""
 
 
-def _configuration(folder: Path) -> Path:
-    run = TrainConfig(method="mgail_ts_h", data=Path("data"), out=Path("out"))
-    spec = AgentSpec(action_space="bicycle", dt=0.2, discriminator=DiscriminatorConfig(), searches=True)
-    (folder / "agent.json").write_text(to_json(spec))
-    (folder / "config.json").write_text(to_json(run))
-    return folder / "config.json"
-
-
-def _read_configuration(folder: Path, _: str) -> tuple[str, str]:
-    try:
-        to_json(read_json(TrainConfig, folder / "config.json"))
-        to_json(read_json(AgentSpec, folder / "agent.json"))
-    except ConfigError:
-        return REFUSED, ""
-    return ACCEPTED, ""
-
-
 def _submission(folder: Path) -> Path:
     scenarios = [womd_record(name, tracks=2 - k) for k, name in enumerate(NAMES)]
     write_records(folder / "a.tfrecord", [each.SerializeToString() for each in scenarios])
@@ -491,7 +473,6 @@ TARGETS: dict[str, Target] = {
     "test_area": reader("interaction", lambda folder: taf(folder, rows=_cars())),
     "scenarionet": reader("scenarionet", scenarionet), "store": Target(written(_store), _change_store, _read_store),
     "checkpoint": Target(written(_checkpoint), _change_checkpoint, _load_checkpoint),
-    "configuration": Target(written(_configuration), _change_some, _read_configuration),
     "submission": Target(written(_submission), _change_submission, _check_submission),
     "rollouts": Target(written(_rollouts), _change_rollouts, _read_rollouts),
 }  # fmt: skip

@@ -19,19 +19,20 @@ from symphony.evaluation.planners import run_score
 from symphony.metrics.intervals import beta_quantile, grouped_mean, t_quantile
 
 Run = dict[str, Any]
-Kind = Literal["rate", "mean", "difference of rates"]
+_ALIKE = 1e-9  # standard error below which groups do not differ but by rounding
+Kind = Literal["rate", "share", "mean", "difference of rates"]
 
 
 @dataclass(frozen=True)
 class Measure:
     """A number for each run, None where it is not defined: a ``rate``, 100 for a run in which something happens and 0
-    for any other, or a ``mean``; with its unit and a description for people.
+    for any other, a ``share`` from 0 to 100, or a ``mean``; with its unit and a description for people.
     """
 
     of: Callable[[Run], float | None]
     unit: str
     text: str
-    kind: Literal["rate", "mean"] = "mean"
+    kind: Literal["rate", "share", "mean"] = "mean"
 
 
 def _happens(name: str, text: str) -> Measure:
@@ -42,7 +43,8 @@ def _happens(name: str, text: str) -> Measure:
 
 
 def _number(name: str, unit: str, text: str) -> Measure:
-    return Measure(lambda run: None if run["failed"] else run[name], unit, text)
+    kind: Literal["share", "mean"] = "share" if unit == "% of time" else "mean"
+    return Measure(lambda run: None if run["failed"] else run[name], unit, text, kind)
 
 
 MEASURES: dict[str, Measure] = {
@@ -53,8 +55,8 @@ MEASURES: dict[str, Measure] = {
     "wrong_way_rate": _happens("wrong_way_time", "runs against the traffic"),
     "blocking_rate": _happens("blocking_time", "runs that block traffic"),
     "failed_rate": Measure(lambda run: 100.0 * bool(run["failed"]), "% of runs", "runs that failed", "rate"),
-    "score": Measure(run_score, "of 100", "score"),
-    "pdm_score": Measure(lambda run: run["pdm_score"], "of 100", "PDM score"),
+    "score": Measure(run_score, "of 100", "score", "share"),
+    "pdm_score": Measure(lambda run: run["pdm_score"], "of 100", "PDM score", "share"),
     "progress_ratio": _number("progress_ratio", "", "progress relative to the log's"),
     "offroad_time": _number("offroad_time", "% of time", "time off the road"),
     "wrong_way_time": _number("wrong_way_time", "% of time", "time against the traffic"),
@@ -89,9 +91,10 @@ def estimate(
     bounds over groups, each with a confidence between 0.5 and 1.
 
     Bounds of a mean are Student's t, with the degrees of freedom of as many equal groups as weigh alike; of a
-    difference of rates not nearer than the bound of a rate where nothing happened. Those of a rate are the exact
-    binomial ones of as many independent runs as the scatter between groups says there are, and of as many as there
-    are groups where nothing or everything happened.
+    difference of rates, and of shares that are the same in all groups, not nearer than the bound of a rate where
+    nothing happened; of other means that are the same, unknown. Those of a rate are the exact binomial ones of as
+    many independent runs as the scatter between groups says there are, and of as many as there are groups where
+    nothing or everything happened.
     """
     known = [(value, group) for value, group in zip(values, groups, strict=True) if value is not None]
     value = np.array([value for value, _ in known], np.float64)
@@ -103,10 +106,11 @@ def estimate(
     if kind == "rate":
         high, low = (_rate_bound(part, number, count, confidence) for part in (value / 100, 1 - value / 100))
         return Estimate(mean, 100.0 * (1 - low), 100.0 * high, len(value), count)
-    if error is None:
+    alike = error is not None and error < _ALIKE
+    if error is None or (alike and kind == "mean"):
         return Estimate(mean, None, None, len(value), count)
     spread = t_quantile(confidence, len(value) ** 2 / int((np.bincount(number) ** 2).sum()) - 1) * error
-    if kind == "difference of rates":
+    if alike or kind == "difference of rates":
         spread = max(spread, 100.0 * beta_quantile(confidence, 1, count))
     return Estimate(mean, mean - spread, mean + spread, len(value), count)
 

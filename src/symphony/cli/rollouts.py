@@ -115,19 +115,28 @@ class View(shared.Command):
             else:
                 count = self.rollouts or (None if out.suffix[1:].lower() in FORMATS else 1)
                 for name in names if self.segments else names[:6]:
-                    for folder in (folder for folder in folders if name in folder.ids):
-                        title = errors.printable(f"{shared.short_name(folder.about.agent)}: {name}")
-                        clips.append(render.saved_clip(folder.of(name), count, title))
+                    for place, folder in zip(places(folders), folders, strict=True):
+                        if name in folder.ids:
+                            title = errors.printable(f"{place}{shared.short_name(folder.about.agent)}: {name}")
+                            clips.append(render.saved_clip(folder.of(name), count, title))
                 render.draw_clips(clips, out, columns=len(folders) if len(folders) > 1 else 3)
         shared.say(f"written: {out}")
+
+
+def places(folders: list[Any]) -> list[str]:
+    """Return what tells folders of rollouts apart, as much of the ends of their paths as it takes; nothing of one."""
+    parts = [one.path.resolve().parts for one in folders]
+    ends = [["/".join(part[-n:]) for part in parts] for n in range(1, 1 + max(map(len, parts)))]
+    shortest = next(end for end in ends if len(set(end)) == len(set(parts)))
+    return [f"{place}: " for place in shortest] if len(folders) > 1 else [""]
 
 
 def write_view(folders: list[Any], reports: list[Any], out: Path) -> None:
     """Write the page that plays the rollouts of folders, with the findings of their reports marked in it."""
     from symphony.render.viewer import view_page
 
-    pairs, several = list(zip(folders, reports, strict=True)), len(folders) > 1
-    names = [f"{one.path.name}: {one.about.agent}" if several else one.about.agent for one in folders]
+    pairs = list(zip(folders, reports, strict=True))
+    names = [f"{place}{one.about.agent}" for place, one in zip(places(folders), folders, strict=True)]
     ids = dict.fromkeys(name for folder in folders for name in folder.ids)
     found = ([report.replay(of.of(name)) if name in of.ids else None for of, report in pairs] for name in ids)
     files.write_file(out, view_page(names, found))

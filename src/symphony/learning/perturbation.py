@@ -14,7 +14,7 @@ from symphony.envs.dynamics import Bicycle, Displacement, bicycle_inverse, bicyc
 from symphony.geometry.frames import rotate, wrap
 
 ALONG, ACROSS = 1.5, 1.0
-"""Seconds in which an error along and across the road dies out to a third or so."""
+"""Time constants of the return along and across the road, in seconds; after 2.3 of them a third is left."""
 AHEAD, ASIDE, TURNED, FASTER = 1.5, 0.5, 0.1, 1.5
 """Standard deviations of displacements along the road and aside (metres), in heading (radians) and in speed (m/s)."""
 SLOWEST = 2.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -75,7 +76,7 @@ def plot_curves(
     for axes, (title, names) in zip(slots, panels.items(), strict=True):
         _style(axes, title)
         for run, found in curves.items():
-            for name, dashes in zip(names, DASHES, strict=False):
+            for name, dashes in zip(names, cycle(DASHES), strict=False):
                 if name in found:
                     style = {"color": colors[run], "linestyle": dashes}
                     _draw_curve(axes, *found[name], window, f"{name}-{run}", **style)
@@ -84,7 +85,7 @@ def plot_curves(
         axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
         if len(names) > 1:
             ink: dict[str, Any] = {"color": INK, "linewidth": 1.2}
-            pairs = zip(names, DASHES, strict=False)
+            pairs = zip(names, cycle(DASHES), strict=False)
             lines = [Line2D([], [], linestyle=dashes, label=name, **ink) for name, dashes in pairs]
             axes.legend(handles=lines, fontsize=6.5, framealpha=0.8, edgecolor="none", handlelength=2.2)
     for axes in slots[-columns:]:

@@ -282,17 +282,20 @@ def draw_hit(axes: Axes, clip: Clip) -> Patch | None:
     segment, heights = clip.segment, agent_heights(clip.segment)
     over: set[tuple[int, int, int, int]] = set()
     for rollout, rank, at in np.argwhere(clip.collision & clip.valid).tolist():
-        step = clip.start + at
+        step, agent = clip.start + at, clip.agents[rank]
         near = clip.others[segment.valid[clip.others, step]]
         if len(heights):  # as in `symphony.geometry.frames.levels_apart`
-            mine, its = heights[step, clip.agents[rank]], heights[step, near]
+            # An agent is as high as its log where that is nearest, as in `symphony.saved.rollouts.world_of`.
+            away = np.linalg.norm(segment.position[agent, :, :2] - clip.position[rollout, rank, at], axis=-1)
+            mine = heights[np.where(segment.valid[agent], away, np.inf).argmin(), agent]
+            its = heights[step, near]
             apart = (its[:, 1] != mine[1]) & (its[:, 1] * mine[1] > 0) & (abs(its[:, 0] - mine[0]) >= LEVEL)
             near = near[~apart]
-        size = segment.size[clip.agents[[rank]]]
+        size = segment.size[[agent]]
         here = clip.position[[rollout], rank, at], clip.heading[[rollout], rank, at], size
         there = segment.position[near, step], segment.heading[near, step], segment.size[near]
         own, boxes = shapely.Polygon(place(CORNERS, *here)[0]), shapely.polygons(place(CORNERS, *there))
-        over |= {(rollout, rank, agent, step) for agent in near[shapely.intersects(own, boxes)].tolist()}
+        over |= {(rollout, rank, other, step) for other in near[shapely.intersects(own, boxes)].tolist()}
     # One may go on when the next begins.
     found = {(agent, step) for *run, agent, step in over if (*run, agent, step - 1) not in over}
     if not found:

@@ -5,10 +5,10 @@ Legend: A agents, U states, L lanes, Q lights. Coordinates are those of the sour
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import xml.etree.ElementTree as ET
-import zlib
 from itertools import count, groupby
 from typing import Any
 
@@ -39,7 +39,7 @@ def commonroad(saved: SavedRollouts, rollout: int) -> str:
     """
     segment = saved.segment
     letters = "".join(word.capitalize() for word in re.findall("[A-Za-z]+", segment.segment_id)) or "Segment"
-    number = 1 + zlib.crc32(segment.segment_id.encode()) % 999_999  # names hold nothing else
+    number = 1 + int(hashlib.sha256(segment.segment_id.encode()).hexdigest()[:12], 16)  # names hold nothing else
     name = f"ZAM_{letters[:60]}-{number}_{rollout + 1}_T-1"
     about = {"commonRoadVersion": "2020a", "benchmarkID": name, "timeStepSize": repr(float(segment.dt))}
     source = f"symphony: segment {segment.segment_id}, rollout {rollout}"

@@ -381,19 +381,29 @@ def own_network(file: Path, folder: Path) -> Path:
 
 
 def _limited(root: ET.Element) -> ET.ElementTree[ET.Element]:
-    """Return an OpenDRIVE map whose lanes without a speed limit have that of their road, which SUMO does not read."""
+    """Return an OpenDRIVE map whose lanes have the limits of their road as their own, as SUMO reads no others."""
     for node in root.iter():
         node.tag = node.tag.rpartition("}")[2]
     refuse(root.find("road[@rule='LHT']") is not None, "drives on the left, which is not supported", "rule")
     for road in root.iterfind("road"):
         limits = [(number(kind.get("s"), "type"), kind.find("speed")) for kind in road.iterfind("type")]
-        for section in road.iterfind("lanes/laneSection"):
-            begin = number(section.get("s"), "laneSection")
-            limit = next((speed for at, speed in reversed(limits) if at <= begin), None)
+        sections = road.findall("lanes/laneSection")
+        begins = [number(section.get("s"), "laneSection") for section in sections]
+        for section, begin, end in zip(sections, begins, [*begins[1:], np.inf], strict=True):
+            first = max((at for at, _ in limits if at <= begin), default=begin)
             for lane in section.iterfind("*/lane"):
+                own = lane.find("speed")
+                until = end if own is None else begin + number(own.get("sOffset"), "speed")
+                place = len(lane) if own is None else list(lane).index(own)
                 # A road may have a limit that is no number, "no limit" or "undefined"; a lane may not.
-                if limit is not None and limit.get("max", "")[:1].isdigit() and lane.find("speed") is None:
-                    lane.append(ET.Element("speed", limit.attrib, sOffset="0"))
+                lane[place:place] = [
+                    ET.Element("speed", limit.attrib, sOffset=f"{max(at - begin, 0.0):.9g}")
+                    for at, limit in limits
+                    if at >= first
+                    and max(at, begin) < until
+                    and limit is not None
+                    and limit.get("max", "")[:1].isdigit()
+                ]
     return ET.ElementTree(root)
 
 
