@@ -17,7 +17,7 @@ EXTRAS := dev,docs,argoverse2,ray,sumo,gym,video,mcap
 SPELLED := src tests recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md SECURITY.md
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo picture table test test-lowest fuzz kills mutate coverage audit bench lint format docs clean
+.PHONY: help setup demo picture table test test-lowest fuzz kills coverage audit bench lint format docs clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-12s %s\n", $$1, $$2}'
@@ -51,11 +51,6 @@ KILLS_ARGS ?= --kills 30
 
 kills: $(DEV)  ## kill everything that writes at random moments, resume, and compare with undisturbed work
 	OMP_NUM_THREADS=1 nice $(BIN)/python tests/tools/kills.py $(KILLS_ARGS)
-
-MUTATE_ARGS ?= --changes 10
-
-mutate: $(DEV)  ## change operators in what computes; tell which changes no test notices
-	OMP_NUM_THREADS=1 nice $(BIN)/python tests/tools/mutate.py $(MUTATE_ARGS)
 
 # Not among the development packages, as nothing else needs it; processes of their own are not counted.
 coverage: $(DEV)  ## run the tests in one process and report which branches of src they take; slow

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers_saved import played
-from helpers_segments import crossing, hide, make_segment, straight_road
+from helpers_segments import crossing, hide, make_road, make_segment, straight_road
 from helpers_store import fill
 from symphony.bench.criticality import GENTLE, HARD, LONGEST, criticality, hardest
 from symphony.bench.published import PDM, comfortable, derivative, pdm
@@ -97,6 +97,23 @@ def test_another_that_crosses_behind_the_ego_comes_close_in_time(dt: float, monk
     heights = np.tile(np.float32([[0, 1], [6, 2]]), (meets.num_steps, 1, 1))
     monkeypatch.setattr("symphony.bench.criticality.agent_heights", lambda segment: heights)
     assert criticality(meets).encroachment == math.inf
+
+
+@pytest.mark.parametrize(("height", "margin"), [(0.0, 0.0), (8.0, 3.0)])
+def test_the_edges_of_a_bridge_are_no_edges_below_it(height: float, margin: float) -> None:
+    """The ego drives down the middle of a road of 8 m, below another one."""
+    along = np.arange(-80, 81, 2.0)
+
+    def lines(*aside: float, z: float = 0.0) -> list[Any]:
+        return [np.column_stack([along, np.full_like(along, y), np.full_like(along, z)]) for y in aside]
+
+    above = [line[:, [1, 0, 2]] for line in lines(0, -4, 4, z=height)]
+    road = make_road([*lines(0), above[0]], boundary=[*lines(-4, 4), *above[1:]])
+    position = np.zeros((1, 41, 3)) + np.array([0, 0, 0.75])
+    position[0, :, 0] += 2 * np.arange(41) - 40
+    moves = np.zeros((1, 41)), np.tile([10.0, 0.0], (1, 41, 1))
+    ego = make_segment(road, position, *moves, 0.2, size=np.array([[4.5, 2.0, 1.5]], np.float32))
+    assert criticality(ego).margin == pytest.approx(margin, abs=1e-6)
 
 
 def test_who_follows_in_a_lane_does_not_cross() -> None:

@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import NonTensorData, TensorDict
 from tensordict.nn import TensorDictModule
 from torch.testing import assert_close
 from torchrl.envs import ParallelEnv, PendulumEnv, SerialEnv, TransformedEnv, UnaryTransform
@@ -128,6 +128,10 @@ class Drawing(Walk):
         return out.set(X, out.get(X) + drawn + torch.rand(drawn.shape))
 
 
+def noted():
+    return TransformedEnv(Walk(), UnaryTransform([X], ["note"], fn=lambda x: NonTensorData("text", x.shape[:1])))
+
+
 def remembering():
     env, calls = Walk(), itertools.count()
     search(starts(env, 1, branches=1), env=env)  # by itself it remembers nothing
@@ -137,7 +141,7 @@ def remembering():
 @pytest.mark.parametrize(("env", "why"), [
     (lambda: SerialEnv(2, Walk), "batch-locked"),
     (lambda: ParallelEnv(1, Walk, mp_start_method="forkserver"), "batch-locked"),
-    (remembering, r"another \('agents', 'x'\) when stepped"),
+    (noted, "no tensor, 'note'"), (remembering, r"another \('agents', 'x'\) when stepped"),
     (Counting, r"another \('agents', 'x'\) when stepped"),
 ])  # fmt: skip
 def test_what_remembers_can_not_be_branched(env, why):

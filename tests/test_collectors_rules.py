@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from helpers_collectors import Mass, hashed
@@ -169,8 +169,10 @@ def test_a_value_is_zero_where_all_have_terminated_one_after_the_other():
     how: dict[str, Any] = {"steps": 3, "prune_every": 3, "value": lambda td: torch.full(td.shape, 5.0)}
     score = collectors.KeyScore(("agents", "reward"))
     each = [Mass(agents=2, sticky=sticky, limit=1.45) for sticky in (False, True)]
-    loose, lasting = (collectors.beam_search(env, policy, score, start, **how).leaf_costs for env in each)
-    assert torch.equal(loose, lasting)
+    for every in (1, 2, 3):
+        apart = {**how, "prune_every": every, "accumulate": True}
+        loose, lasting = (collectors.beam_search(env, policy, score, start, **apart).leaf_costs for env in each)
+        assert torch.equal(loose, lasting)
     start = collectors.branch(collectors.with_rows(Mass(limit=0.6), [9]).reset(), 4)
     score, how = collectors.KeyScore("reward"), {**how, "prune_every": 1, "accumulate": True}
     found = collectors.beam_search(Mass(limit=0.6), hashed, score, start, **how)
@@ -296,3 +298,66 @@ def test_bad_parameters_are_errors():
     for rule, value in ((best, 0.0), (best, 1.1), (best, math.nan), (systematic, 0.0), (replace, math.nan)):
         with pytest.raises(ValueError, match=r"fraction|temperature|threshold"):
             rule(value)
+
+
+class Groups(EnvBase):
+    """Cars and walkers that count their steps; each ends, by itself, beyond a limit of its own."""
+
+    batch_locked = False
+
+    def __init__(self, **limits: list[float]) -> None:
+        super().__init__()
+        self.limits = {name: torch.tensor(limit)[:, None] for name, limit in limits.items()}
+
+        def spec(*names: str, flag: bool = False) -> Composite:
+            def made(n: int) -> Any:
+                return Binary(1, shape=(n, 1), dtype=torch.bool) if flag else Unbounded((n, 1))
+
+            sizes = {group: len(limit) for group, limit in limits.items()}
+            return Composite({k: Composite({name: made(n) for name in names}, shape=(n,)) for k, n in sizes.items()})
+
+        self.observation_spec, self.state_spec, self.action_spec = spec("place"), spec("place"), spec("action")
+        self.reward_spec, self.done_spec = spec("reward"), spec("done", "terminated", flag=True)
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+    def _at(self, places: dict[str, Tensor], shape: Any) -> TensorDict:
+        found = TensorDict(batch_size=shape)
+        for group, place in places.items():
+            over = place > self.limits[group]
+            found[group] = TensorDict({"place": place, "done": over, "terminated": over.clone()}, place.shape[:-1])
+        return found
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        shape = torch.Size() if tensordict is None else tensordict.shape
+        return self._at({name: torch.zeros(*shape, *limit.shape) for name, limit in self.limits.items()}, shape)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        found = self._at({name: tensordict[name, "place"] + 1 for name in self.limits}, tensordict.shape)
+        for name in self.limits:
+            found[name, "reward"] = torch.ones_like(found[name, "place"])
+        return found
+
+
+@pytest.mark.parametrize("walkers", [[9.0, 9.0], [9.0, 1.0], [9.0, 1.0, 9.0], [1.0, 1.0, 1.0]])
+def test_ends_in_one_group_change_nothing_in_another(walkers):
+    """Scores of all groups end with their agents, those of one alone go on while anybody does."""
+    env = Groups(cars=[9.0, 3.0], walkers=walkers)
+
+    def idle(td: TensorDictBase) -> TensorDictBase:
+        for name, limit in env.limits.items():
+            td.set((name, "action"), torch.zeros(*td.shape, *limit.shape))
+        return td
+
+    def everyone(td: TensorDictBase) -> Tensor:
+        return torch.cat([td[name, "reward"] for name in env.limits], -2).squeeze(-1)
+
+    how: dict[str, Any] = {"steps": 6, "prune_every": 3, "rule": collectors.KeepAll()}
+    start = collectors.branch(env.reset().unsqueeze(0), 2)
+    found = collectors.beam_search(env, idle, everyone, start, **how)
+    ends = torch.tensor([9.0, 3.0, *walkers])
+    expected = (torch.arange(6)[:, None] <= ends).float()
+    assert torch.equal(found.scores, expected.expand(1, 2, 6, -1))
+    alone = collectors.beam_search(env, idle, collectors.KeyScore(("cars", "reward")), start, **how)
+    assert torch.equal(alone.scores, torch.ones(1, 2, 6, 2))

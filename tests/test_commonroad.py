@@ -17,10 +17,12 @@ from helpers_store import fill
 from symphony.agents import load_agent
 from symphony.bench.published import pdm
 from symphony.config.evaluation import SimulateConfig
+from symphony.data import convert as conversion
 from symphony.data.segment import MarkType, RunSegment, SignalState, content_hash
 from symphony.data.sources import get_reader
 from symphony.data.sources.lines import SLIT, drivable_rings
 from symphony.envs import scene
+from symphony.errors import ConfigError
 from symphony.evaluation.planners import run_score
 from symphony.evaluation.report import report
 from symphony.planners.interface import scenario_of
@@ -294,6 +296,8 @@ def test_the_ego_of_a_planning_problem_is_on_its_way_to_the_goal(path, tmp_path,
     np.testing.assert_allclose(segment.size[0], [4.508, 1.61, 0])
     np.testing.assert_allclose(segment.position[0, 0] + segment.origin, [5, 0, 0], atol=1e-5)
     np.testing.assert_allclose(segment.goal + segment.origin[:2], place, atol=0.2)
+    with pytest.raises(ConfigError, match="planning problem has none"):
+        conversion.convert("commonroad", [path], tmp_path / "near", radius=50.0, reader_options={"egos": "problem"})
     store = fill(tmp_path / "store", [segment])
     assert (store[0].goal, store.tags(0)) == (segment.goal, {})
     assert scenario_of(store[0], 0, np.zeros((0, 2)), np.zeros(4), 0).goal.tolist() == segment.goal

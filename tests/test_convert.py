@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 from helpers_convert import FakeReader, scene
 from helpers_processes import apart
-from helpers_segments import crossing
+from helpers_segments import crossing, hide
 from helpers_sources import off_road
 from helpers_store import contents
 from symphony import parallel as engine
@@ -35,7 +35,7 @@ from symphony.data.convert import Report, convert, expand, info, merge
 from symphony.data.odd import crop
 from symphony.data.report import Skip
 from symphony.data.resample import resample, smooth
-from symphony.data.segment import Polylines, content_hash, validate
+from symphony.data.segment import Polylines, SignalState, content_hash, validate
 from symphony.data.selection import road_points
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
@@ -78,6 +78,18 @@ def test_segments_are_smoothed_resampled_and_kept_in_order(logs: Write, out: Pat
     assert store.report == report.to_json()
     assert left(out) == ["store"]
     store.verify()
+
+
+def test_what_lies_between_the_new_steps_or_before_the_ego(logs: Write, out: Path, monkeypatch: Any) -> None:
+    """An agent that is seen at odd steps alone is left out; a light keeps what the log knew before the ego came."""
+    log = hide(hide(crossing(4, steps=91, dt=0.1), 0, slice(0, 3)), 3, np.arange(91) != 8)
+    state = np.where(np.arange(91) == 1, SignalState.STOP, SignalState.UNKNOWN) + np.zeros_like(log.signal_state)
+    log = log.replace(signal_state=state.astype(np.uint8))
+    monkeypatch.setattr("helpers_convert.scene", lambda *_: log)
+    convert(FakeReader(), [logs("a.scene", "crossing 0")], out, hold_lights=True)
+    (found,) = SegmentStore(out)
+    assert found.agent_id.tolist() == log.agent_id[:3].tolist()
+    assert (found.signal_state == SignalState.STOP).all()
 
 
 def test_bad_records_and_files_are_told_and_passed_over(logs: Write, out: Path) -> None:

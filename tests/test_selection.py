@@ -142,6 +142,24 @@ def test_relations_are_mutual(seed: int, make: Any) -> None:
             assert np.isfinite(getattr(here, one)[0]) == np.isfinite(getattr(there, two)[0])
 
 
+@pytest.mark.parametrize("height", [0.0, 8.0])
+def test_who_is_on_a_bridge_is_no_partner(height: float) -> None:
+    """The ego passes below one that crosses and below one that drives ahead; its leader is 20 m ahead of both."""
+    east, lift = np.column_stack([EAST, np.zeros(2)]), np.array([0, 0, height])
+    road = make_road([east, east[:, [1, 0, 2]] + lift, east + lift])
+    position = np.zeros((4, STEPS, 3)) + np.array([0, 0, 0.75])
+    for agent, start in ((0, -40), (2, -20), (3, -30)):
+        position[agent, :, 0] += start + 10 * TIME
+    position[1, :, 1] += 10 * TIME - 50
+    position[[1, 3], :, 2] += height
+    heading = np.zeros((4, STEPS))
+    heading[1] = np.pi / 2
+    way = 10 * np.stack([np.cos(heading), np.sin(heading)], -1)
+    size = np.array([[4.5, 2.0, 1.5]] * 4, np.float32)
+    found = interactive_choice(make_segment(road, position, heading, way, DT, size=size), 2)
+    assert (found.agents[1], found.context) == ((2, Context.LEADER) if height else (1, Context.CROSSING))
+
+
 def test_a_partner_that_is_seen_throughout_goes_first() -> None:
     context, paths = CASES["crosses"]
     segment = hide(scene(paths), 1, slice(STEPS - 1, STEPS))

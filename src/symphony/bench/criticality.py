@@ -15,7 +15,7 @@ import shapely
 import torch
 from numpy.typing import NDArray
 
-from symphony.data.levels import agent_heights
+from symphony.data.levels import agent_heights, levels_of
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.evaluation.contacts import time_to_collision
@@ -67,8 +67,8 @@ class Criticality:
 
 
 def criticality(found: RunSegment | SavedRollouts, rollout: int | None = None) -> Criticality:
-    """Return how critical a log or a rollout is for its ego; agents on another level do not count. Boxes that overlap
-    in a log are measurement errors; in a rollout the ego collides, and the time to collision is 0.
+    """Return how critical a log or a rollout is for its ego; what is on another level does not count. Boxes that
+    overlap in a log are measurement errors; in a rollout the ego collides, and the time to collision is 0.
     """
     if isinstance(found, SavedRollouts):
         segment, world = found.segment, world_of(found, rollout or 0)
@@ -82,17 +82,28 @@ def criticality(found: RunSegment | SavedRollouts, rollout: int | None = None) -
         world = World(position, heading, velocity, segment.valid, size, height)
     seen = np.flatnonzero(world.valid[segment.ego])
     slower = np.diff(world.speed[segment.ego, seen]) / (np.diff(seen) * segment.dt)
-    lines = [segment.road.boundary[k][:, :2] for k in range(len(segment.road.boundary))]
-    edges = shapely.union_all([shapely.LineString(line) for line in lines if len(line) > 1])
     ttc = time_to_collision(world, np.array([segment.ego]))
     return Criticality(
         segment.segment_id,
         0.0 if hits else float(ttc[ttc > 0].min(initial=math.inf)),
         _encroachment(world, segment, seen),
         float(-slower.min(initial=0.0)) + 0.0,
-        float(shapely.distance(edges, _boxes(world, segment.ego, seen)).min(initial=math.inf)) if edges else math.inf,
+        _margin(world, segment, seen),
         rollout,
     )
+
+
+def _margin(world: World, segment: RunSegment, seen: NDArray[np.int64]) -> float:
+    """Return the least metres between the ego's box and the boundary of its level."""
+    lines, boxes = segment.road.boundary, _boxes(world, segment.ego, seen)
+    ends = [np.stack([lines[k][:-1], lines[k][1:]], 1) for k in range(len(lines))]
+    pieces = np.concatenate([*ends, np.zeros((0, 2, 3))])
+    edges = shapely.linestrings(pieces[..., :2])
+    if world.height is None or (levels := levels_of(segment)).flat:
+        return float(shapely.STRtree(edges).query_nearest(boxes, return_distance=True)[1].min(initial=math.inf))
+    there = torch.from_numpy(levels.at(pieces.mean(1)))
+    apart = levels_apart(torch.from_numpy(world.height[segment.ego, seen])[:, None], there)
+    return float(shapely.distance(boxes[:, None], edges)[~apart.numpy()].min(initial=math.inf))
 
 
 def _encroachment(world: World, segment: RunSegment, seen: NDArray[np.int64]) -> float:

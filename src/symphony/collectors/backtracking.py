@@ -99,7 +99,8 @@ class Course:
 class Run(NamedTuple):
     """A period of branches [*b, S] (of lines [R, 1]) as simulated: the kept entries of its steps, their scores, which
     are 0 after the end of an episode, which steps came before (or were) the end of each agent's episode, or of all
-    agents' (K = 1), which episodes have ended, the last states, and their values (or of those that ended episodes).
+    agents' (K = 1), which episodes have ended, the last states, their values (or of those that ended episodes), and
+    which of the episodes terminated.
     """
 
     records: list[TensorDictBase]
@@ -108,6 +109,7 @@ class Run(NamedTuple):
     ended: Bool[Tensor, "*b S K"]
     after: TensorDictBase
     worth: Float[Tensor, "*b S"] | None = None
+    terminated: Bool[Tensor, "*b S K"] | None = None
 
 
 @torch.no_grad()

@@ -45,7 +45,8 @@ class BeamSearchResult:
 
     Attributes:
         trajectories: [*b, L, T] steps of the leaves, laid out and named as by ``env.rollout``, kept entries only.
-        scores: [*b, L, T, N] scores of what each step of the leaves led to, 0 after the end of an episode.
+        scores: [*b, L, T, N] scores of what each step of the leaves led to, 0 after the end of an episode: of each
+            agent's, if N are all agents that end apart (of several groups in the order of ``env.done_keys``).
         alive: [*b, L, T] steps before (and with) the end of their episodes.
         slots: [*b, P, L] int64, the slot in which each period of each leaf's history was simulated.
         totals: [*b, P, S] aggregate of each period, by the slot that simulated it.
@@ -185,8 +186,9 @@ def beam_search(
         pruning = Pruning(start, rule, len(periods), group_key=group_key, noise=noise, accumulate=accumulate)
         now, records, scores, alive = start, [], [], []
         worth: Any = None if value is None else 0.0
+        terminated = _ended(env, start, start.ndim, "terminated") & ended
         for period, length in enumerate(periods):
-            run = simulation.run(now, ended, length)
+            run = simulation.run(now, ended, length, terminated)
             records += run.records
             scores.append(run.scores)
             alive.append(run.alive)
@@ -199,7 +201,8 @@ def beam_search(
                 place = _places(parents, start)
                 now, ended = take(run.after, place), take_values(run.ended, place, start.ndim)
                 now = now.update(run.after.select(*slot_keys))
-                worth = None if worth is None else take_values(worth, place, start.ndim)
+                if worth is not None and run.terminated is not None:
+                    worth, terminated = (take_values(one, place, start.ndim) for one in (worth, run.terminated))
             del run  # or its last states live through the next period
 
     tree = TensorDict.stack(records, -1)
@@ -270,8 +273,10 @@ class Simulation:
     value: Score | None = None
     width: int = 0  # lines that are simulated at a time, the last again where there are fewer
 
-    def run(self, now: TensorDictBase, ended: Bool[Tensor, "*b S K"], length: int) -> Run:
-        """Simulate a period of some steps."""
+    def run(
+        self, now: TensorDictBase, ended: Bool[Tensor, "*b S K"], length: int, terminated: Tensor | None = None
+    ) -> Run:
+        """Simulate a period of some steps, of branches of which some agents may have ended, or terminated, before."""
         if len(now) < self.width:
             lines = torch.arange(self.width, device=ended.device).clamp_max(len(now) - 1)[:, None]
             found = self.run(take(now, lines), take_values(ended, lines, 2), length)
@@ -291,13 +296,20 @@ class Simulation:
         joined = torch.stack(scores, -2)
         if not self.until_done:
             alive = torch.ones(*joined.shape[:-1], 1, dtype=torch.bool, device=joined.device)
-            return Run(records, joined, alive, ended, now, None if self.value is None else self._valued(now))
+            ahead = None if self.value is None else self._valued(now)
+            return Run(records, joined, alive, ended, now, ahead, terminated)
         over = torch.stack(ends, -2).cumsum(-2) > 0
-        ahead = None if self.value is None else self._worth(states, over.all(-1))
+        if self.value is None or terminated is None:
+            ahead = terminated = None
+        else:
+            # Flags may not last; of what follows the end of an agent none counts.
+            each = torch.stack([_ended(self.env, state, over.ndim - 2, "terminated") for state in states], -2)
+            terminated = terminated | (each & ~over[..., :-1, :]).any(-2)
+            ahead = self._worth(states, over.all(-1), terminated.all(-1))
         alive = ~over[..., :-1, :]
         if alive.shape[-1] not in (1, joined.shape[-1]):
             alive = alive.any(-1, keepdim=True)
-        return Run(records, torch.where(alive, joined, 0.0), alive, over[..., -1, :], now, ahead)
+        return Run(records, torch.where(alive, joined, 0.0), alive, over[..., -1, :], now, ahead, terminated)
 
     def _valued(self, state: TensorDictBase) -> Float[Tensor, "*b S"]:
         assert self.value is not None  # noqa: S101  (not asked for otherwise)
@@ -306,17 +318,16 @@ class Simulation:
             raise ValueError(f"values must be {[*state.shape]}, are {[*found.shape]}")
         return found
 
-    def _worth(self, states: Sequence[TensorDictBase], over: Bool[Tensor, "*b S _"]) -> Float[Tensor, "*b S"]:
-        """Return the values of the states that branches came to, or ended in: 0 if that terminated their episodes."""
+    def _worth(
+        self, states: Sequence[TensorDictBase], over: Bool[Tensor, "*b S _"], terminated: Bool[Tensor, "*b S"]
+    ) -> Float[Tensor, "*b S"]:
+        """Return the values of the states that branches came to, or ended in: 0 if their episodes have terminated."""
         came, steps = states[-1], len(states)
         if bool(over[..., -1].any()):
             last = (~over[..., 1:]).sum(-1).clamp_max(steps - 1)
             first = torch.arange(0, last.numel() * steps, steps, device=last.device).reshape(last.shape)
             came = take(TensorDict.stack(states, last.ndim), first + last)
-        # The flag of one that ended may not last; what follows the end of all does not count.
-        each = torch.stack([_ended(self.env, state, over.ndim - 1, "terminated") for state in states], -2)
-        terminated = (each & ~over[..., :-1, None]).any(-2) | _ended(self.env, came, over.ndim - 1, "terminated")
-        return torch.where(terminated.all(-1), 0.0, self._valued(came))
+        return torch.where(terminated, 0.0, self._valued(came))
 
     def total(self, run: Run, length: int | None = None) -> Float[Tensor, "*b S"]:
         """Return the totals of a period, or of its first steps alone."""
@@ -347,16 +358,14 @@ def _step(
 
 
 def _ended(env: EnvBase, state: TensorDictBase, batch: int, how: str = "done") -> Bool[Tensor, "*b S K"]:
-    """Return whether the episode is done, for each of K agents if they end separately, else for all (K = 1)."""
+    """Return whether the episode is done, for each of K agents (of all groups) if they end apart, else for all."""
     names = [below(key)[1:] for key in env.done_keys if last_name(key) == how]
     # As TorchRL has it, the end of a group is that of all that is nested in it.
     outer = [n for n in names if not any(len(o) < len(n) and n[: len(o) - 1] == o[:-1] for o in names)]
     flags = [state.get(key).flatten(batch) for key in outer if state.get(key, None) is not None]
     if not flags:
         return torch.zeros(*state.shape[:batch], 1, dtype=torch.bool, device=state.device)
-    if len({flag.shape for flag in flags}) > 1:
-        flags = [flag.any(-1, keepdim=True) for flag in flags]
-    return torch.stack(flags).any(0)
+    return torch.cat(flags, -1)
 
 
 def _places(slots: Int[Tensor, "*b _"], start: TensorDictBase) -> Int[Tensor, "*b _"]:

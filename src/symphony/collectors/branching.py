@@ -9,7 +9,7 @@ from weakref import WeakSet
 
 import torch
 from jaxtyping import Int, Shaped
-from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor, is_non_tensor, unravel_key
 from torch import Tensor, nn
 from torchrl.data import Composite
 from torchrl.envs import (
@@ -192,14 +192,17 @@ def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:
     """Refuse an environment that keeps anything outside the TensorDict: copies of its branches would share it.
 
     It must accept any batch shape, or any that begins with its own, which rules out GymEnv, VmasEnv, SerialEnv,
-    ParallelEnv and whatever wraps a simulator of its own; random numbers of its own are allowed. Given a state, it is
-    also stepped from it twice by the same random numbers, once in its lifetime: if the results differ, it remembers
-    something. One whose class says ``branchable = True`` skips that trial, which waits for the device.
+    ParallelEnv and whatever wraps a simulator of its own; generators of torch of its own are allowed. Given a state,
+    all entries of which must be tensors, it is also stepped from it twice by the same random numbers, once in its
+    lifetime: if the results differ, it remembers something, or draws other random numbers than torch's. One whose
+    class says ``branchable = True`` skips that trial, which waits for the device.
 
     Raises ValueError if it can't be branched.
     """
     base, transforms = parts_of(env)
     _check_shape(base, base.batch_size if state is None else state.shape)
+    if state is not None:
+        _check_tensors(env, state)
     if state is None or env in _PASSED or (getattr(base, "branchable", False) and not transforms):
         return
     one = state[..., :1]
@@ -212,11 +215,19 @@ def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:
             with same_numbers(trial):
                 recall(trial, one)
                 results.append(trial.step(acting.copy()).get("next"))
+    _check_tensors(env, results[0])
     for key, value in results[0].items(True, True):
         # A device may add up in another order each time.
         if not torch.allclose(results[1].get(key), value, rtol=1e-4, atol=1e-5, equal_nan=True):
-            raise _refusal(env, f"gave another {key!r} when stepped from the same state again")
+            why = f"gave another {key!r} when stepped from the same state again, or draws random numbers not of torch"
+            raise _refusal(env, why)
     _PASSED.add(env)
+
+
+def _check_tensors(env: EnvBase, state: TensorDictBase) -> None:
+    for key, value in state.items(True, is_leaf=is_leaf_nontensor):
+        if is_non_tensor(value):
+            raise _refusal(env, f"has an entry that is no tensor, {key!r}")
 
 
 def _refusal(env: EnvBase, why: str) -> ValueError:

@@ -34,10 +34,10 @@ class BeamSearchCollector(Collector):
     - ``("collector", "beam_score")`` [..., T, N]: score of each step and agent,
     - ``("collector", "beam_total")`` [..., T]: aggregate of the period that the step belongs to,
     - ``("collector", "beam_slot")`` [..., T] int64: slot in which the step was simulated,
-    - ``("collector", "mask")`` [..., T] bool: False after the end of an episode; TorchRL's losses leave such steps
-      out. With ``trajs_per_batch`` they are dropped.
+    - ``("collector", "mask")`` [..., T] bool: False after the end of an episode, of the first agent's where they end
+      apart; TorchRL's losses leave such steps out. With ``trajs_per_batch`` they are dropped.
     - with the rule :class:`Systematic`, ``("collector", "log_weight")`` [..., T]: of the leaf, relative to the mean
-      weight of its tree. Losses may weight leaves by its exponential.
+      weight of its tree. Its exponential weights leaves as the policy times ``exp(-total / temperature)`` does.
     - with `keep_tree`, ``"tree"``, a TensorDict [*env.batch_size, S, T] of all simulated steps, by slot, pruned
       branches included, with their ``("collector", "beam_score")``.
 

@@ -24,9 +24,11 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from symphony.data import joins, overlaps, store_format
 from symphony.data import resample as resampling
-from symphony.data.odd import crop, from_ego, oddities
+from symphony.data.odd import crop, from_ego, oddities, with_agents
 from symphony.data.report import Report, Skip
 from symphony.data.resample import MAX_SIGMA
 from symphony.data.segment import MAX_AGENTS, MAX_DT, MIN_DT, RunSegment
@@ -66,7 +68,8 @@ class Preparation:
 
     def _prepared(self, segment: RunSegment, path: str) -> RunSegment | Skip:
         try:
-            segment = from_ego(segment)
+            # What the log knows of lights before the ego comes holds, too.
+            segment = from_ego(resampling.hold_lights(segment) if self.hold_lights else segment)
             if self.strict and segment.odd:
                 kind, example = next(iter(segment.odd.items()))
                 raise DataError(f"{kind} ({example})", field="strict")
@@ -74,9 +77,8 @@ class Preparation:
             segment = segment.replace(road=road, joined_gaps=gaps)
             if self.sigma > 0:
                 segment = resampling.smooth(segment, self.sigma)
-            if self.hold_lights:
-                segment = resampling.hold_lights(segment)
             segment = resampling.resample(segment, self.dt)
+            segment = with_agents(segment, np.asarray(segment.valid.any(axis=1)))  # some were seen in between
             if self.radius is not None:
                 segment = crop(segment, self.radius)
             excluded = exclusion(segment, self.interactive)
@@ -117,9 +119,8 @@ def tasks_of(recipe: Preparation, files: list[list[Any]], folder: Path) -> list[
 
 
 def make_part(task: Task) -> Path:
-    """Convert the files of a task, unless that was done before; the part appears once it is complete.
-
-    Its report has a list of ``entries`` for each file: the number of a segment in the part, or a skipped record.
+    """Convert the files of a task, unless that was done before; the part appears once it is complete. Its report has
+    a list of ``entries`` for each file: the number of a segment in the part, or a skipped record.
     """
     if task.path.exists():
         return task.path
@@ -211,6 +212,8 @@ def convert(
             raise ConfigError(f"{name} must be between {least:g} and {most:g}, is {value:g}")
     out = Path(out).resolve()
     reader, options = _reader(reader, reader_options)
+    if radius is not None and options.get("egos") == "problem":
+        raise ConfigError("radius keeps what is near the ego's logged path; the ego of a planning problem has none")
     settings = {"reader": reader.name, "rate": rate, "interactive": interactive, "smooth": smooth} | options
     given = {"exclude_overlaps": exclude_overlaps, "hold_lights": hold_lights, "strict": strict, "radius": radius}
     settings |= {name: value for name, value in given.items() if value}

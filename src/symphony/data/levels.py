@@ -81,9 +81,8 @@ class Levels:
             yield row, first[row] + rank
 
     def at(self, points: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-        """Return [..., 2] height and level (0 for none) of points [..., 3] on the ground, from their columns.
-
-        Points in columns without lines are taken to those of the nearest one within 10 m.
+        """Return [..., 2] height and level (0 for none) of points [..., 3] on the ground, from their columns. Points
+        in columns without lines are taken to those of the nearest one within 10 m.
         """
         place = points.reshape(-1, 3)
         level, known = np.zeros(len(place)), np.zeros(len(place), bool)

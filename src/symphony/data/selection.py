@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from symphony.data.levels import LEVEL, ground
 from symphony.data.segment import AgentType, Bools, RunSegment, line_lengths, wrap
 from symphony.errors import DataError
 
@@ -25,6 +26,7 @@ CONFLICT_GAP = 4.0
 Between two customary limits: 3 s on the difference in time to the conflict point (INTERACTION data set, Zhan et al.,
 2019, arXiv:1910.03088) and 5 s on the post-encroachment time (SSAM, FHWA-HRT-08-051, 2008)."""
 QUEUE_SPEED, KEPT = 5.0, 1.0  # m/s at which TIME_GAP is the distance of slower ones; seconds it must be kept
+STEEP = 0.15  # metres of height for each metre between two cars of a queue that a street may have
 TILE = 1_000_000  # pairs of steps that are compared at a time
 
 
@@ -114,9 +116,8 @@ class _Meeting:
 
 
 def _places(segment: RunSegment, others: Rows, steps: slice, spacing: Reals) -> tuple[Reals, Bools, Bools]:
-    """Compare each of the ego's steps [t] with each of the others' [k, t, T].
-
-    Returns metres the ego is ahead, whether both are in one place the same way, and whether at an angle.
+    """Compare each of the ego's steps [t] with each of the others' [k, t, T]. Returns metres the ego is ahead,
+    whether both are in one place the same way, and whether at an angle.
     """
     ego, position = segment.ego, segment.position[..., :2]
     delta = position[ego, None, steps, None] - position[others][:, None]
@@ -127,6 +128,8 @@ def _places(segment: RunSegment, others: Rows, steps: slice, spacing: Reals) -> 
     both = segment.valid[ego, None, steps, None] & segment.valid[others][:, None]
     # A place lies between two logged steps as a rule: half the way to the next one is added.
     both &= along <= theirs / 2 + 0.5
+    low = ground(segment)[..., 2]
+    both &= np.abs(low[ego, None, steps, None] - low[others][:, None]) < LEVEL
     shared = both & (turn < SAME_WAY) & (aside <= HALF_LANE)
     crosses = (turn >= SAME_WAY) & (turn <= np.pi - SAME_WAY)
     return along, shared, both & crosses & (aside <= spacing[:, None] / 2 + 0.5)
@@ -168,7 +171,9 @@ def _queue_gap(segment: RunSegment, others: Rows, sign: int) -> Reals:
     gap = along / np.maximum(speed, QUEUE_SPEED)
     turn = np.abs(wrap(segment.heading[ego] - heading))
     kept = segment.valid[ego] & segment.valid[others] & (along > 0) & (gap <= TIME_GAP)
-    kept &= (np.abs(aside) <= HALF_LANE) & (turn < SAME_WAY)
+    low = ground(segment)[..., 2]
+    apart = np.abs(low[ego] - low[others]) >= LEVEL + STEEP * along
+    kept &= (np.abs(aside) <= HALF_LANE) & (turn < SAME_WAY) & ~apart
     long_enough = kept.sum(1) * segment.dt >= KEPT
     return np.where(long_enough, np.where(kept, gap, np.inf).min(1), np.inf)
 

@@ -185,9 +185,8 @@ class SegmentStore(Sequence[RunSegment]):
 
     @cached_property
     def groups(self) -> NDArray[np.str_]:
-        """The recording [segments] that each segment is part of: :attr:`RunSegment.group`.
-
-        It is the segment's id where the store does not know; the simulated network for stores of earlier releases.
+        """The recording [segments] that each segment is part of: :attr:`RunSegment.group`. It is the segment's id
+        where the store does not know; the simulated network for stores of earlier releases.
         """
         tags = (self._parsed(i, text) for i, text in enumerate(self._texts("tags")))
         return np.array([_group(*each) for each in zip(tags, self.ids, strict=True)], np.str_)
@@ -253,9 +252,8 @@ class SegmentStore(Sequence[RunSegment]):
         return hashlib.sha256(self._segments["hash"][order].tobytes()).hexdigest()
 
     def verify(self, progress: Callable[[int, int], None] | None = None) -> None:
-        """Read everything, and compare it with the hashes and the schema; the tags must be JSON.
-
-        A :class:`DataError` names the first segment that has changed. ``progress`` gets done and total.
+        """Read everything, and compare it with the hashes and the schema; the tags must be JSON. A :class:`DataError`
+        names the first segment that has changed. ``progress`` gets done and total.
         """
         for number, key in enumerate(self.map_hashes):
             if content_hash(self.road(number)) != key.hex():
@@ -309,9 +307,8 @@ def _span(values: NDArray[Any]) -> dict[str, float]:
 
 
 def _read_indices(folder: Path) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return records of the segments, and of the maps they lie on, memory-mapped.
-
-    A :class:`DataError` says if an index is missing, cut short or contradicts itself.
+    """Return records of the segments, and of the maps they lie on, memory-mapped. A :class:`DataError` says if an
+    index is missing, cut short or contradicts itself.
     """
     segments = _read_index(folder, SEGMENTS, None)
     count, axes = segments["count"], SEGMENTS.axes

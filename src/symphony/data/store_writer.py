@@ -88,9 +88,8 @@ class StoreWriter(AbstractContextManager["StoreWriter"]):
         return self._write(segment.segment_id, values, scalars, digest, road_digest, road)
 
     def copy(self, store: SegmentStore, index: int) -> int:
-        """Add a segment of another store, tags included; many times faster than reading and appending it.
-
-        Returns its index, or raises a :class:`DataError` where one of that name is there already.
+        """Add a segment of another store, tags included; many times faster than reading and appending it. Returns its
+        index, or raises a :class:`DataError` where one of that name is there already.
         """
         record, values = store.raw(SEGMENTS, index)
         map_record, road = store.raw(MAPS, int(record["map"]))

@@ -35,9 +35,8 @@ class UnexpectedError(DataError):
 
 
 class Reader(ABC):
-    """Turns the files of one format into run segments at the log's own rate.
-
-    A segment whose ``group`` a reader leaves empty is a group of its own.
+    """Turns the files of one format into run segments at the log's own rate. A segment whose ``group`` a reader
+    leaves empty is a group of its own.
     """
 
     name: ClassVar[str]  # name of the format, also :attr:`RunSegment.source`
@@ -147,9 +146,8 @@ def read_whole(path: Path, most: int | None = None) -> bytes:
 
 
 def load_xml(path: Path, what: str = "CommonRoad") -> ET.Element:
-    """Parse a file that declares no document type, which rules out every kind of entity attack.
-
-    ``what`` is the name of the format, for the :class:`DataError` where the file is something else.
+    """Parse a file that declares no document type, which rules out every kind of entity attack. ``what`` is the name
+    of the format, for the :class:`DataError` where the file is something else.
     """
     data = read_whole(path)
 

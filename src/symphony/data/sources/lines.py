@@ -188,7 +188,6 @@ def stretches(ring: Doubles, keep: Bools) -> list[Doubles]:
 
 def cut_ends(bounds: Sequence[tuple[Doubles, Doubles]], links: Links) -> Doubles:
     """Return [N, 2, 2] the line across each lane's end or start where no other lane goes on: there a map was cut.
-
     Takes left and right bound [P, 2] of each lane, in the direction of travel, and all the successors.
     """
     goes, comes = set(links[:, 0].tolist()), set(links[:, 1].tolist())
