@@ -338,25 +338,34 @@ def test_lights_stand_where_their_lane_enters_the_junction(driven: list[RunSegme
 
 
 def test_nobody_drives_over_a_red_light(driven: list[RunSegment]) -> None:
-    """Few cross the line while their light shows red: none that was red for the last two seconds."""
-    crossings = offences = 0
+    """Few cross the line while their light shows red: none that was red for the last two seconds. Who waits at it
+    starts when it is green, not before.
+    """
+    crossings = offences = waited = 0
     for s in driven:
         along = np.stack([np.cos(s.heading), np.sin(s.heading)], -1)
         nose = s.position[..., :2] + s.size[:, None, :1] / 2 * along
         for q, lane in enumerate(s.signal_lane):
+            away, pace = np.linalg.norm(nose - s.signal_point[q, :2], axis=-1), np.linalg.norm(s.velocity, axis=-1)
+            for green in (
+                np.flatnonzero((s.signal_state[q, 3:] == SignalState.GO) & (s.signal_state[q, 2:-1] < 5)) + 3
+            ):
+                waits = s.valid[:, green] & (away[:, green - 3] < 2) & (pace[:, green - 3] < 0.01)
+                waited += waits.sum()
+                assert (pace[waits, green] < 0.1).all()
             line = shapely.LineString(s.road.lanes[lane][:, :2])
             on = (shapely.distance(line, shapely.points(nose)) < 0.6) & s.valid
             crossed = on[:, 12:] & ~on[:, 11:-1] & s.valid[:, 11:-1]
             for agent, step in zip(*np.nonzero(crossed), strict=True):
                 near = np.linalg.norm(nose[agent, step + 11] - s.signal_point[q, :2]) < 4
-                speed = np.linalg.norm(s.velocity[agent, step + 11])
                 red = (s.signal_state[:, step + 2 : step + 12] == SignalState.STOP).all(1)
                 # Movements that share a start can't be told apart at the line.
                 same = np.linalg.norm(s.signal_point - s.signal_point[q], axis=-1) < 1
-                if near and speed > 1:
+                if near and pace[agent, step + 11] > 1:
                     crossings += 1
                     offences += bool(red[same].all())
     assert crossings > 5
+    assert waited > 1
     assert offences == 0
 
 

@@ -119,15 +119,15 @@ def _preset(counts: tuple[int, int, int], *checksums: str) -> Preset:
 PRESETS: dict[str, Preset] = {
     "town-small": _preset(
         (2_000, 200, 500),
-        "bc250bfc215864d18e132821f7a9eb786dd5ed51f20f3a06aba403eabf700a07",
-        "f683fa0e9d9cad2d792be1652c7108d13ce6c42ece6f5a76f3bb707444cf061a",
-        "0cfa3e8c082441702d7cc19962bbda606b9941f7434c8c8837f5ef39ad20bbe2",
+        "a0e36f57eb51a7f5f32f2515034d9f37d2dd783aa3821c6e6c536c4636e97acd",
+        "33383d075ad99ffe68dffc191d76512f80ce9490d0cc4e503b5edf2c2a671ce0",
+        "6cba2b0806d3b801b4601b1718ae4852f1d05a151dee28baa21b2faebee936ee",
     ),
     "town": _preset(
         (10_000, 200, 1_000),
-        "5fcd71bef8cc5ea81c118cd28b933280b344eb492a98caba9fcc3a8e1235b141",
-        "f683fa0e9d9cad2d792be1652c7108d13ce6c42ece6f5a76f3bb707444cf061a",
-        "c2c4a0677f9b780f20f23af5d57b00dc5961d840bcc8b4d95eacc7ff3f0d032d",
+        "733d55e15f2a3342cd864f9936f9a9205027efbc4118f8b855091de22f0c2db1",
+        "33383d075ad99ffe68dffc191d76512f80ce9490d0cc4e503b5edf2c2a671ce0",
+        "9285526cbca60e634bd62aaec2cba1ebdb7c812c2cacd7bc87e0231a5bcc66fd",
     ),
 }
 """The standard sets: towns with signals, all kinds of unsignalled control and roundabouts, 10 s, N_I = 2."""

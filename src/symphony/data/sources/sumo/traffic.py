@@ -30,6 +30,8 @@ DEPART_WITHIN = 15.0  # seconds in which the vehicles of a closed network enter 
 STEP = 0.1  # seconds per simulation step and per recorded position
 _SIGMA, _REACH = 0.25, 8
 """Seconds, and samples on either side, of the smoothing kernel; tracks lose as many at both ends."""
+REACTION = 0.6
+"""Seconds by which lights come early: SUMO's drivers react to them at once, and smoothed tracks .2 s before that."""
 _FRONT_OVERHANG, _REAR_OVERHANG = 0.19, 0.22
 """Distance of the axles from the ends of the box, as shares of its length."""
 _STATES = {
@@ -175,7 +177,9 @@ def simulate_traffic(
     velocity = np.gradient(position, STEP, axis=1)
     # At both ends of a track the difference is with an absent neighbour.
     present = np.asarray(np.isfinite(velocity).all(axis=-1))
-    lights = {light: _read_lights(folder / f"lights{k}.xml", time) for k, light in enumerate(network.connectors)}
+    lights = {
+        light: _read_lights(folder / f"lights{k}.xml", time + REACTION) for k, light in enumerate(network.connectors)
+    }
     return Traffic(size, position, heading, velocity, present, lights)
 
 
