@@ -26,8 +26,9 @@ STEERING, BRAKING = 0.5, 4.0
 def displaced(logged: Float[Tensor, "M 4"], rng: torch.Generator) -> Float[Tensor, "M 4"]:
     """Return states x, y, heading, speed near logged ones.
 
-    Errors are normal, times a number drawn uniformly from 0 to 1 for each state. Slow vehicles are moved less across
-    and turned less, fast ones are turned less, so that no vehicle starts off sideways.
+    Errors are normal, times a number drawn uniformly from 0 to 1 for each state. Slow vehicles are moved less across,
+    turned less and sped up less, fast ones are turned less, so that no vehicle starts off sideways. A standing one
+    keeps its speed: else most slow states would be of those that wait, and a policy would brake when it starts.
     """
     normal = torch.randn(len(logged), 4, generator=rng)
     share = torch.rand(len(logged), generator=rng)
@@ -35,7 +36,7 @@ def displaced(logged: Float[Tensor, "M 4"], rng: torch.Generator) -> Float[Tenso
     slow = (speed / 4.0).clamp_max(1.0)
     shift = torch.stack([normal[:, 0] * AHEAD, normal[:, 1] * ASIDE * slow], -1)
     turn = normal[:, 2] * TURNED * slow * (8.0 / speed.clamp_min(8.0))
-    faster = normal[:, 3] * FASTER
+    faster = normal[:, 3] * FASTER * slow
     return torch.cat(
         [
             logged[:, :2] + rotate(share[:, None] * shift, logged[:, 2]),
