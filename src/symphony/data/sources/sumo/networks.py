@@ -393,7 +393,7 @@ def _limited(root: ET.Element) -> ET.ElementTree[ET.Element]:
             first = max((at for at, _ in limits if at <= begin), default=begin)
             for lane in section.iterfind("*/lane"):
                 own = lane.find("speed")
-                until = end if own is None else begin + number(own.get("sOffset"), "speed")
+                until = end if own is None else begin + number(own.get("sOffset", "0"), "speed")
                 place = len(lane) if own is None else list(lane).index(own)
                 # A road may have a limit that is no number, "no limit" or "undefined"; a lane may not.
                 lane[place:place] = [
