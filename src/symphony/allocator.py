@@ -22,9 +22,8 @@ def tune() -> bool:
 
 
 def release() -> bool:
-    """Give free pages, wherever in the heap, back to the system, once in many steps; return whether any were.
-
-    Else a long training's heap would grow without end: what stays settles where a large block was freed.
+    """Give free pages, wherever in the heap, back to the system, once in many steps; return whether any were. Else a
+    long training's heap would grow without end: what stays settles where a large block was freed.
     """
     return bool((library := _ours()) and library.malloc_trim(0))
 

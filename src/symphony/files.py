@@ -96,9 +96,8 @@ def finite(value: Any) -> Any:
 
 
 class Lock(AbstractContextManager["Lock"]):
-    """Keeps other writers, who get an error, out of a folder or a file until it is closed or this process ends.
-
-    The file at ``path``, removed in the end, stands for the ``output``, by default its folder, which is made.
+    """Keeps other writers, who get an error, out of a folder or a file until it is closed or this process ends. The
+    file at ``path``, removed in the end, stands for the ``output``, by default its folder, which is made.
     """
 
     def __init__(self, path: Path, output: Path | None = None) -> None:

@@ -66,9 +66,8 @@ def _file(name: str) -> Any:
 
 
 def lazily(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return ``__getattr__`` and ``__dir__`` of a package whose names are imported when they are asked for.
-
-    Its ``if TYPE_CHECKING`` block says where they are from. A name must not also be that of a module of the package.
+    """Return ``__getattr__`` and ``__dir__`` of a package whose names are imported when they are asked for. Its ``if
+    TYPE_CHECKING`` block says where they are from. A name must not also be that of a module of the package.
     """
     source = Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8")
     nodes = [node for block in ast.parse(source).body if isinstance(block, ast.If) for node in block.body]

@@ -12,9 +12,8 @@ from torch import Tensor
 
 @unique
 class Stream(IntEnum):
-    """Uses of random numbers with a stream of their own, derived from that of a scene or a rollout.
-
-    Rollouts, branches and agents, which fold into the same streams, count from 0. A use keeps its number for good.
+    """Uses of random numbers with a stream of their own, derived from that of a scene or a rollout. Rollouts,
+    branches and agents, which fold into the same streams, count from 0. A use keeps its number for good.
     """
 
     GOALS = 1 << 40  # routes of the agents of a scene

@@ -72,9 +72,8 @@ MEASURES: dict[str, Measure] = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """The mean over the runs that have a number, None if none has, and the groups of their segments.
-
-    With this confidence each, the mean is not below ``low`` and not above ``high``; None where that is unknown.
+    """The mean over the runs that have a number, None if none has, and the groups of their segments. With this
+    confidence each, the mean is not below ``low`` and not above ``high``; None where that is unknown.
     """
 
     mean: float | None

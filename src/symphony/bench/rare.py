@@ -85,9 +85,8 @@ class Rate:
 
 @dataclass(frozen=True)
 class Hunt:
-    """Simulates a planner in weighted trees, in scenes with routes whose first agents are egos.
-
-    ``config`` says how many; ``metric`` is a rate of :data:`symphony.bench.measures.MEASURES`.
+    """Simulates a planner in weighted trees, in scenes with routes whose first agents are egos. ``config`` says how
+    many; ``metric`` is a rate of :data:`symphony.bench.measures.MEASURES`.
     """
 
     agent: Agent

@@ -215,9 +215,8 @@ def with_pdm(found: Report, folder: RolloutFolder) -> list[Run]:
 
 
 def _beyond(one: Threshold, pair: Pair) -> bool:
-    """Return whether a rate will be beyond its limit even if nothing happens in the remaining runs.
-
-    The mean of all runs is beyond the limit then, and so is its bound: stopping changes no verdict.
+    """Return whether a rate will be beyond its limit even if nothing happens in the remaining runs. The mean of all
+    runs is beyond the limit then, and so is its bound: stopping changes no verdict.
     """
     measure = MEASURES[one.metric]
     if one.compared or one.side != "at_most" or measure.kind != "rate":

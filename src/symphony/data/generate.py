@@ -142,7 +142,6 @@ BARREN = 50  # networks in a row that may give nothing before the plan is given 
 @dataclass(frozen=True)
 class Harvest:
     """The yield of one network: the segments taken, how many there could have been, and why windows were left out.
-
     ``error`` says why it gave nothing at all, if it failed; ``seconds`` is the time it took on one core.
     """
 

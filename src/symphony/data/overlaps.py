@@ -52,9 +52,8 @@ def _pairs(segment: RunSegment, drivers: NDArray[np.int64]) -> NDArray[np.int64]
 
 
 def box_depth(way: Doubles, angle_a: Doubles, size_a: Doubles, angle_b: Doubles, size_b: Doubles) -> Doubles:
-    """Return [N] metres by which two boxes overlap, by the separating-axis test; 0 or less if they do not.
-
-    Takes the way [N, 2] from the centre of one to that of the other, headings [N], lengths and widths [N, 2].
+    """Return [N] metres by which two boxes overlap, by the separating-axis test; 0 or less if they do not. Takes the
+    way [N, 2] from the centre of one to that of the other, headings [N], lengths and widths [N, 2].
     """
     boxes: Any = ((angle_a, size_a / 2), (angle_b, size_b / 2))
     depth = np.full(len(way), np.inf)

@@ -15,9 +15,8 @@ from symphony.errors import DataError
 
 @dataclass(frozen=True)
 class Skip:
-    """A record or file that was left out: the reason, and its place where known.
-
-    ``exclusion`` is the one of :data:`symphony.data.selection.EXCLUSIONS` it fell under; empty for unusable data.
+    """A record or file that was left out: the reason, and its place where known. ``exclusion`` is the one of
+    :data:`symphony.data.selection.EXCLUSIONS` it fell under; empty for unusable data.
     """
 
     message: str

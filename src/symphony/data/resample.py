@@ -58,9 +58,8 @@ def _lights(state: Ints, steps: Ints) -> Ints:
 
 
 def hold_lights(segment: RunSegment) -> RunSegment:
-    """Give lights the last state that the log knows, where it knows none, and the first one before that.
-
-    For logs that show lights at a single step: an agent that has never met an unknown light may wait at it for ever.
+    """Give lights the last state that the log knows, where it knows none, and the first one before that. For logs
+    that show lights at a single step: an agent that has never met an unknown light may wait at it for ever.
     """
     state = segment.signal_state
     known = state != SignalState.UNKNOWN

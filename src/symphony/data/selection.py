@@ -44,7 +44,6 @@ class Context(StrEnum):
 
 class Relations(NamedTuple):
     """The relations of K vehicles to the ego: seconds [K] between the two, infinite where there is no such relation.
-
     They are taken where paths merge, where they cross, and as the smallest time gap ahead and behind on one path.
     """
 
@@ -180,7 +179,6 @@ def _queue_gap(segment: RunSegment, others: Rows, sign: int) -> Reals:
 
 def _merge_gap(segment: RunSegment, other: int, mine: int, theirs: int) -> float:
     """Return the seconds between the ego and another where their paths become one; infinite if they always were one.
-
     Both paths are followed backwards from that place by the same distances: they must have been apart or at an angle.
     """
     ahead, beside = _way_back(segment, segment.ego, mine), _way_back(segment, other, theirs)
@@ -214,9 +212,8 @@ MOVING = 2.0  # metres of logged travel past which an agent counts as moving
 
 
 def travel(segment: RunSegment) -> NDArray[np.float32]:
-    """Return [A] the farthest each agent gets from where it is first seen, in metres.
-
-    A distance, not a path length: the jitter of a parked car's track does not add up.
+    """Return [A] the farthest each agent gets from where it is first seen, in metres. A distance, not a path length:
+    the jitter of a parked car's track does not add up.
     """
     agents = np.arange(segment.num_agents)
     start = segment.position[agents, segment.valid.argmax(1), :2]
@@ -317,9 +314,8 @@ def _partner(segment: RunSegment, others: Rows, moves: Rows) -> tuple[int | None
 
 
 def road_points(segment: RunSegment) -> int:
-    """Return the number of points of lanes, boundary and markings once each line has one at least every 2 m.
-
-    Raw logs differ in density (WOMD: 0.5 m), so the paper's limit is applied to this number.
+    """Return the number of points of lanes, boundary and markings once each line has one at least every 2 m. Raw logs
+    differ in density (WOMD: 0.5 m), so the paper's limit is applied to this number.
     """
     lines = (segment.road.lanes, segment.road.boundary, segment.road.marks)
     return sum(int((np.ceil(line_lengths(each) / POINT_SPACING) + 1).sum()) for each in lines)

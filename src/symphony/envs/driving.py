@@ -249,9 +249,8 @@ class DrivingEnv(EnvBase):
         return self._from_state(self._read(state))
 
     def choices(self, state: TensorDictBase) -> TensorDictBase:
-        """Add the feasible routes of a start state, as the goal policy observes them.
-
-        Writes ``ROUTES`` [..., N, G, F] and ``ROUTES_MASK`` [..., N, G] into a copy.
+        """Add the feasible routes of a start state, as the goal policy observes them. Writes ``ROUTES`` [..., N, G,
+        F] and ``ROUTES_MASK`` [..., N, G] into a copy.
         """
         row, state = state.get(keys.SCENE).squeeze(-1), state.copy()
         (moved,), routes = _flat(row.ndim, state.get(keys.STATE)), self.scenes.routes.among(row.flatten())

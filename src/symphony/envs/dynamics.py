@@ -229,9 +229,8 @@ def _follow(
     valid: Bool[Tensor, "*b T"],
     advance: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
 ) -> tuple[Shaped[Tensor, "*_"], Float[Tensor, "*b T 4"]]:
-    """Step through a log: ``advance(state, target, known)`` gives an action and the state it leads to.
-
-    ``known`` says where the target and the logged state before it are valid. After a gap in the log it starts anew.
+    """Step through a log: ``advance(state, target, known)`` gives an action and the state it leads to. ``known`` says
+    where the target and the logged state before it are valid. After a gap in the log it starts anew.
     """
     time, state = log.ndim - 2, log[..., 0, :]
     states, actions = [state], []

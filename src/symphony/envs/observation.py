@@ -28,9 +28,8 @@ _DISTANCES = 1 << 16  # distances held at a time
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """The extent of an agent's observation, and how it is scaled to numbers near one.
-
-    What is not asked for is neither computed nor an entry of a step: simulation without observation costs a fraction.
+    """The extent of an agent's observation, and how it is scaled to numbers near one. What is not asked for is
+    neither computed nor an entry of a step: simulation without observation costs a fraction.
     """
 
     num_objects: int = 16  # nearest agents kept; 0 for no entries of objects
@@ -183,9 +182,8 @@ def nearest_points(
     origin: Float[Tensor, "M N 2"],
     height: Float[Tensor, "M N 2"] | None = None,
 ) -> tuple[Int[Tensor, "M N K"], Bool[Tensor, "M N K"]]:
-    """Return numbers of the nearest points among all points of all scenes, and which of them exist.
-
-    With heights and levels, points on other levels do not (see :func:`symphony.geometry.levels_apart`).
+    """Return numbers of the nearest points among all points of all scenes, and which of them exist. With heights and
+    levels, points on other levels do not (see :func:`symphony.geometry.levels_apart`).
     """
     count, total = tables.config.num_points, tables.position[0].shape[1]
     if not on_host(origin) or total <= count:

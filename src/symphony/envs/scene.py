@@ -70,9 +70,8 @@ class MapEdge(NamedTuple):
 
 
 def map_edge(graph: LaneGraph) -> MapEdge:
-    """Return where the map of a lane graph ends.
-
-    A lane goes nowhere if neither it nor a lane beside it has a successor: an on-ramp is left by a lane change.
+    """Return where the map of a lane graph ends. A lane goes nowhere if neither it nor a lane beside it has a
+    successor: an on-ramp is left by a lane change.
     """
     exits = []
     for lane in graph.usable_lanes.tolist():

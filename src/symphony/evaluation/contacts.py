@@ -143,9 +143,8 @@ class _Party(NamedTuple):
 
 
 def at_fault(world: World, found: Contacts, lanes: Lanes, offroad: Bools, lights: Lights) -> Bools:
-    """Return whether the agent of each contact is at fault [E].
-
-    ``offroad`` says which agents are off the road [A, U]; ``lights`` are red ones that any agent of a contact ran.
+    """Return whether the agent of each contact is at fault [E]. ``offroad`` says which agents are off the road [A,
+    U]; ``lights`` are red ones that any agent of a contact ran.
     """
     if not len(found.agent):
         return np.zeros(0, bool)

@@ -47,7 +47,6 @@ _LANE = 2.5  # metres aside within which a light is that of an agent's lane
 
 class Lanes:
     """The lanes of a run segment, and which of them are on the level of a place (see :mod:`symphony.data.levels`).
-
     ``graph`` says how they connect, ``width`` [L] how wide they are, in metres; nominal where the source does not.
     """
 
@@ -317,7 +316,6 @@ def _advance(places: Reals, counted: Bools) -> Reals:
 
 def comfort(saved: SavedRollouts, evaluated: Indices) -> tuple[Reals, Reals, Reals]:
     """Return acceleration, jerk and lateral acceleration of evaluated agents [K, T, M], NaN where it is not known.
-
     They are differences of speed and of acceleration, and speed times yaw rate, over one step each, not smoothed.
     """
     state, dt = saved.state[:, :, evaluated].astype(np.float64), saved.segment.dt

@@ -166,7 +166,6 @@ DISTANCES = ("ade", "min_sade", "curvature_jsd", "curvature_jsd_floor")
 
 def paper_figures(setting: Setting, dataset: PaperData) -> dict[str, dict[str, tuple[float, float]]]:
     """Return the paper's figures (Igl et al., ICRA 2022, tables I and II) by method and metric; empty if it has none.
-
     Each is a mean and its standard error, NaN where there is none; ``paper.csv`` has thousandths of a nat.
     """
     found = {}

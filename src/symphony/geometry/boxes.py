@@ -215,9 +215,8 @@ def covers(turn: _Plane, size_a: Pairs, size_b: Pairs) -> tuple[Tensor, ...]:
 
 
 def _corner_distance(way: _Plane, turn: _Plane, size: Pairs, other_size: Pairs) -> Tensor:
-    """Return smallest distance of the other box's corners from this box (0 inside).
-
-    Takes the way to the other's centre, along and across this one, and cosine and sine of its relative heading.
+    """Return smallest distance of the other box's corners from this box (0 inside). Takes the way to the other's
+    centre, along and across this one, and cosine and sine of its relative heading.
     """
     (x, y), (cos, sin) = way, turn
     half_length, half_width = 0.5 * size[..., 0], 0.5 * size[..., 1]

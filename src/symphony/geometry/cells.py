@@ -129,9 +129,8 @@ class Cells(ABC):
 
 
 class PointCells(Cells):
-    """Cells for the nearest points.
-
-    Takes x and y of points [B, P], infinity for none, and how many are wanted: a map with few more has no cells.
+    """Cells for the nearest points. Takes x and y of points [B, P], infinity for none, and how many are wanted: a map
+    with few more has no cells.
     """
 
     def __init__(self, x: Reals, y: Reals, count: int) -> None:

@@ -18,9 +18,8 @@ def has_values() -> bool:
 
 
 def on_host(tensor: Tensor) -> bool:
-    """Return whether values may steer the computation: on the CPU, where there are any.
-
-    There a step may look at a few numbers to leave out work; elsewhere that would wait for the device.
+    """Return whether values may steer the computation: on the CPU, where there are any. There a step may look at a
+    few numbers to leave out work; elsewhere that would wait for the device.
     """
     return tensor.device.type == "cpu" and has_values()
 
@@ -41,9 +40,8 @@ def spans(begin: NDArray[np.int64] | int, length: NDArray[np.int64]) -> NDArray[
 
 
 def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
-    """Return the places, in the flattened array, of the ``count`` smallest of each row [R, W], ascending.
-
-    Of equal elements the first ones are taken, so the other elements of a row do not matter. NaN counts as infinity.
+    """Return the places, in the flattened array, of the ``count`` smallest of each row [R, W], ascending. Of equal
+    elements the first ones are taken, so the other elements of a row do not matter. NaN counts as infinity.
     """
     if values.shape[1] <= count:
         return np.arange(values.size)
@@ -62,7 +60,6 @@ def smallest(values: NDArray[Any], count: int) -> NDArray[np.int64]:
 
 def nearest(squared: Float[Tensor, "*b K"], count: int) -> tuple[Int[Tensor, "*b n"], Bool[Tensor, "*b n"]]:
     """Return the indices [..., count] of the smallest elements and which are finite; the rest is padded with index 0.
-
     In ascending order of the index; ties go to the elements that come first.
     """
     width = squared.shape[-1]

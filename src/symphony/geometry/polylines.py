@@ -167,7 +167,6 @@ def _segment_axes(
     center: Float[Tensor, "B 1 2"],
 ) -> Float[Tensor, "5 B E"]:
     """Return each segment's unit vector, offsets along (from its middle) and across, and half length: [5, B, E].
-
     Component by component: operations on a last dimension of 2 are ten times slower.
     """
     # Padding may hold anything, NaN included.

@@ -23,9 +23,8 @@ TURNED = math.radians(45)  # a route turns where its direction has changed by th
 def route_turns(
     points: Float[Tensor, "*b K 2"], count: Int[Tensor, "*b"], turned: float = TURNED
 ) -> Int[Tensor, "*b"]:
-    """Return which way routes first turn, as the place in :data:`TURNS`; straight on where they never do.
-
-    Takes the points of each route, in metres, and how many of them exist.
+    """Return which way routes first turn, as the place in :data:`TURNS`; straight on where they never do. Takes the
+    points of each route, in metres, and how many of them exist.
     """
     step = points.diff(dim=-2)
     direction = torch.atan2(step[..., 1], step[..., 0])

@@ -53,7 +53,6 @@ def clustered_mean(values: NDArray[np.float64], member: NDArray[np.int64]) -> tu
 
 def zero_bound(of: int) -> float:
     """Return the percent, about 300 / n, that a rate has at most, with 95 % confidence, if n samples show nothing.
-
     Source: Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26 (1934).
     """
     return 100.0 * (1.0 - 0.05 ** (1.0 / of))

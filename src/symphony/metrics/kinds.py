@@ -199,9 +199,8 @@ def kind_of_contact(
     size_one: Float[Tensor, "M 2"],
     size_two: Float[Tensor, "M 2"],
 ) -> Int[Tensor, " M"]:
-    """Return the :class:`CollisionKind` [M] of contacts from the point of view of the first agent.
-
-    Takes the poses of both before and after the step, the share of it until they overlap, and their boxes.
+    """Return the :class:`CollisionKind` [M] of contacts from the point of view of the first agent. Takes the poses of
+    both before and after the step, the share of it until they overlap, and their boxes.
     """
     sizes = size_one, size_two
     turn = wrap(two[0][:, 2] - one[0][:, 2])

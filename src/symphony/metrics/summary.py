@@ -32,9 +32,8 @@ def curvature_histogram(curvature: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def jensen_shannon(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the Jensen-Shannon divergence [...] of histograms [..., K], in nats (0 to ln 2); NaN if one is empty.
-
-    It is the divergence itself, not its square root.
+    """Return the Jensen-Shannon divergence [...] of histograms [..., K], in nats (0 to ln 2); NaN if one is empty. It
+    is the divergence itself, not its square root.
     """
     counts = [np.asarray(each, dtype=np.float64) for each in (first, second)]
     totals = [each.sum(-1, keepdims=True) for each in counts]
@@ -125,9 +124,8 @@ class SegmentResult:
 
 
 class RolloutMetrics:
-    """Collision rate, off-road time, ADE, minSADE and curvature JSD over any number of batches.
-
-    The order and the division into batches or processes do not change the result.
+    """Collision rate, off-road time, ADE, minSADE and curvature JSD over any number of batches. The order and the
+    division into batches or processes do not change the result.
     """
 
     def __init__(self) -> None:

@@ -88,9 +88,8 @@ class SceneEncoder(nn.Module):
 
 
 class SceneNetwork(nn.Module):
-    """A :class:`SceneEncoder` and an MLP head on its vector, giving `[..., N, outputs]`.
-
-    Only networks that are passed the same encoder share it; ``head`` is the widths of the head's hidden layers.
+    """A :class:`SceneEncoder` and an MLP head on its vector, giving `[..., N, outputs]`. Only networks that are
+    passed the same encoder share it; ``head`` is the widths of the head's hidden layers.
     """
 
     def __init__(self, encoder: SceneEncoder, outputs: int, *, head: Sequence[int] = (128, 128)) -> None:

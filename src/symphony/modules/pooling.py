@@ -87,9 +87,8 @@ def _maxima(function: Function, sets: Sets, valid: Masks) -> Pooled:
 
 
 def _encoded(function: Function, flat: Float[Tensor, "e F"], valid: Bool[Tensor, " e"], dim: int = 0) -> Tensor:
-    """Return all elements encoded, minus infinity where they are masked; on the CPU only the others are encoded.
-
-    The function gives elements along dimension ``dim``, and so does the result.
+    """Return all elements encoded, minus infinity where they are masked; on the CPU only the others are encoded. The
+    function gives elements along dimension ``dim``, and so does the result.
     """
     place = valid.nonzero().squeeze(-1) if on_host(valid) else None
     if place is None or len(place) == 0:

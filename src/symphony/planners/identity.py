@@ -63,9 +63,8 @@ def planner_settings(planners: Planners, seconds: float) -> dict[str, Any]:
 
 
 def _content(value: Any, inside: tuple[int, ...] = ()) -> str:
-    """Return a value in words that are the same in every process, and differ where any part of it differs.
-
-    What Python prints of an array leaves out its middle, of a set is in any order, and of an object may be its name.
+    """Return a value in words that are the same in every process, and differ where any part of it differs. What
+    Python prints of an array leaves out its middle, of a set is in any order, and of an object may be its name.
     """
     if id(value) in inside:
         return "itself"

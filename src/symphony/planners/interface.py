@@ -165,9 +165,8 @@ class Planner(Protocol):
         ...
 
     def plan(self, traffic: Traffic) -> Pose | Control | Sequence[float] | Sequence[Pose] | NDArray[Any]:
-        """Return the plan of the ego until the next step: 4 numbers are a :class:`Pose`, 2 a :class:`Control`.
-
-        Of several targets, a trajectory a step apart, the first is where the ego goes; then it is asked again.
+        """Return the plan of the ego until the next step: 4 numbers are a :class:`Pose`, 2 a :class:`Control`. Of
+        several targets, a trajectory a step apart, the first is where the ego goes; then it is asked again.
         """
         ...
 

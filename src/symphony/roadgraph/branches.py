@@ -150,9 +150,8 @@ def visited_regions(
 def visited_curvatures(
     graph: LaneGraph, position: NDArray[Any], heading: NDArray[Any], valid: NDArray[np.bool_]
 ) -> Reals:
-    """Return average curvatures, 1/m, of all regions visited by any of the trajectories, one entry per visit.
-
-    Shapes as in :func:`visited_regions`.
+    """Return average curvatures, 1/m, of all regions visited by any of the trajectories, one entry per visit. Shapes
+    as in :func:`visited_regions`.
     """
     visited = visited_regions(graph, position, heading, valid)
     return graph.regions.curvature[np.nonzero(visited)[-1]]

@@ -91,9 +91,8 @@ BIKE_LANE = 3  # the lane type that vehicles keep off (see ``LaneType``)
 
 @dataclass(frozen=True)
 class Regions:
-    """Branching regions: the alternatives at each place where a lane has more than one successor.
-
-    Two regions with one parent are alternatives of a choice. A lane is a region once for each branching predecessor.
+    """Branching regions: the alternatives at each place where a lane has more than one successor. Two regions with
+    one parent are alternatives of a choice. A lane is a region once for each branching predecessor.
     """
 
     lane: Indices  # [R] the lane that is the region

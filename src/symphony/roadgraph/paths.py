@@ -83,9 +83,8 @@ def at(line: Reals, arc: Reals, places: Reals) -> Reals:
 
 
 def followed(graph: LaneGraph, before: int, lane: int) -> Reals:
-    """Return the centre line of a lane as followed from the end of the lane before, without that end itself.
-
-    It is the lane's own line where the two meet. Else overlap is left out, and a short blend makes up for the rest.
+    """Return the centre line of a lane as followed from the end of the lane before, without that end itself. It is
+    the lane's own line where the two meet. Else overlap is left out, and a short blend makes up for the rest.
     """
     known = graph.followed.get((before, lane))
     if known is None:
@@ -113,9 +112,8 @@ def distinct(line: Reals) -> Reals:
 
 
 def sharpest(line: Reals, spacing: float = 0.5) -> float:
-    """Return the largest change of direction, in radians, between pieces of :data:`CHORD` metres of a line.
-
-    Pieces may begin anywhere. It is 0 for a line that is shorter than two of them.
+    """Return the largest change of direction, in radians, between pieces of :data:`CHORD` metres of a line. Pieces
+    may begin anywhere. It is 0 for a line that is shorter than two of them.
     """
     arc = arc_lengths(line)
     points = at(line, arc, np.arange(0.0, arc[-1], spacing))

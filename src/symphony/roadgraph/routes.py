@@ -79,9 +79,8 @@ def routes(
 
 
 def _complete(graph: LaneGraph, seeds: Sequence[Path], horizon: float, limit: int) -> list[Path]:
-    """Extend each path to the horizon; nearest choices first, so that the limit cuts only the farthest.
-
-    Very short lanes in a circle would never get there: a path ends after :data:`MAX_LANES`.
+    """Extend each path to the horizon; nearest choices first, so that the limit cuts only the farthest. Very short
+    lanes in a circle would never get there: a path ends after :data:`MAX_LANES`.
     """
     frontier = sorted(set(seeds))[:limit]
     heapq.heapify(frontier)

@@ -186,9 +186,8 @@ def _limits(scenes: SceneBatch, points: Tensor, unknown: float) -> Float[Tensor,
 
 
 def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
-    """Return metres along the routes at which lights stop them.
-
-    A light is on a route if its stop point is; of several at one, that whose lane leads nearest to the route's way.
+    """Return metres along the routes at which lights stop them. A light is on a route if its stop point is; of
+    several at one, that whose lane leads nearest to the route's way.
     """
     out = torch.full((*lines.arc.shape[:2], scenes.light.shape[2]), torch.inf, device=lines.arc.device)
     for b in range(len(scenes)):

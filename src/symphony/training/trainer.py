@@ -89,7 +89,6 @@ class Phase:
 
 def cosine(rates: Mapping[str, float], end: int, begin: int = 0, **ends: int) -> Rates:
     """Return rates that fall to a tenth along a cosine, from update ``begin`` to ``end``, and are 0 after it.
-
     Networks named in ``ends`` learn from update 0 to an end of their own. A KeyError names one without a rate.
     """
     spans = dict.fromkeys(rates, (begin, end)) | {name: (0, last) for name, last in ends.items()}

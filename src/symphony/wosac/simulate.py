@@ -52,9 +52,8 @@ _STOP = (SignalState.ARROW_STOP, SignalState.STOP)
 
 
 def standing(segment: RunSegment) -> NDArray[np.bool_]:
-    """Return [A] the vehicles that have stood for the last second and have no reason to go: no green light ahead.
-
-    In logs, those under a green light go within 8 s, of the others one in eight or fewer.
+    """Return [A] the vehicles that have stood for the last second and have no reason to go: no green light ahead. In
+    logs, those under a green light go within 8 s, of the others one in eight or fewer.
     """
     now = segment.current_step
     past = slice(max(now - round(1 / segment.dt), 0), now + 1)

@@ -26,9 +26,8 @@ def readers() -> tuple[str, ...]:
 
 
 def get_reader(name: str, **options: Any) -> Reader:
-    """Return the reader of a format; ``options`` are the keyword arguments of its class.
-
-    A :class:`ConfigError` says if the name or an option is unknown, or an option has a bad value.
+    """Return the reader of a format; ``options`` are the keyword arguments of its class. A :class:`ConfigError` says
+    if the name or an option is unknown, or an option has a bad value.
     """
     if name not in _READERS:
         close = difflib.get_close_matches(name.lower(), _READERS, n=1, cutoff=0.4)

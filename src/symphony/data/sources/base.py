@@ -200,7 +200,6 @@ def to_float32(array: NDArray[np.float64]) -> Floats:
 
 def motion(position: Doubles, heading: Doubles, velocity: Doubles, valid: Bools) -> dict[str, Any]:
     """Return the fields of a run segment for states; what is not valid becomes 0, and so does an unknown height.
-
     Takes re-centred positions [A, T, 2 or 3], headings [A, T], velocities [A, T, 2] and what is valid [A, T].
     """
     place = np.pad(position, ((0, 0), (0, 0), (0, 3 - position.shape[-1])))

@@ -297,9 +297,8 @@ def _shape(parts: list[ET.Element], field: str) -> Box:
 
 @dataclass(frozen=True)
 class _Lanelet:
-    """A lanelet: its lane, halfway between its bounds [P, 2], its types, and what else it says.
-
-    ``marked`` are painted bounds, ``lights`` ids of traffic lights, ``stop`` [2] is its stop line, or where it ends.
+    """A lanelet: its lane, halfway between its bounds [P, 2], its types, and what else it says. ``marked`` are
+    painted bounds, ``lights`` ids of traffic lights, ``stop`` [2] is its stop line, or where it ends.
     """
 
     lane: Lane
@@ -408,9 +407,8 @@ def _signals(root: ET.Element, ways: Sequence[_Lanelet], steps: NDArray[np.int64
 
 
 def _light(node: ET.Element, steps: NDArray[np.int64], wanted: set[int]) -> tuple[int, str, Codes] | None:
-    """Return (id, direction, state at each time step) of a light that some lanelet refers to.
-
-    Its cycle repeats, its first element beginning at the time offset.
+    """Return (id, direction, state at each time step) of a light that some lanelet refers to. Its cycle repeats, its
+    first element beginning at the time offset.
     """
     name = base.integer(node.get("id"), "trafficLight id")
     if name not in wanted:

@@ -63,9 +63,8 @@ class Rows:
 
 
 def read_rows(path: Path) -> Rows:
-    """Read a track file.
-
-    A :class:`DataError` names file and line if it is too large, empty or cut short, or lacks a column or valid field.
+    """Read a track file. A :class:`DataError` names file and line if it is too large, empty or cut short, or lacks a
+    column or valid field.
     """
     size = path.stat().st_size
     refuse(size > MAX_BYTES, f"{size} bytes, at most {MAX_BYTES} can be read", file=path)

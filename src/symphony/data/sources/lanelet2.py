@@ -105,9 +105,8 @@ Rules = Mapping[int, tuple[Tags, Sequence[Way]]]
 
 @dataclass(frozen=True)
 class LaneletMap:
-    """The content of a file, in metres; lanelets, ways and areas in file order.
-
-    ``odd`` says what was left out, as a map that was cut out of a larger one lacks some of it: kind -> example.
+    """The content of a file, in metres; lanelets, ways and areas in file order. ``odd`` says what was left out, as a
+    map that was cut out of a larger one lacks some of it: kind -> example.
     """
 
     lanelets: Sequence[Lanelet]
@@ -231,9 +230,8 @@ def _aligned(left: Way, right: Way) -> tuple[Way, Way, tuple[bool, bool]]:
 
 
 def _area(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> shapely.Polygon | None:
-    """Return a place for vehicles that has no direction, such as a parking lot; None for others.
-
-    Its participants say who may be there, else its subtype.
+    """Return a place for vehicles that has no direction, such as a parking lot; None for others. Its participants say
+    who may be there, else its subtype.
     """
     named = {name: value for name, value in tags.items() if name.startswith("participant:")}
     allowed = any(n.startswith("participant:vehicle") and value == "yes" for n, value in named.items())
@@ -275,9 +273,8 @@ def middle(source: LaneletMap) -> Doubles:
 
 
 def road_map(source: LaneletMap, origin: Doubles) -> RoadMap:
-    """Return the map relative to an origin [2]; z is 0.
-
-    A :class:`DataError` says if no area can be formed of its lanes.
+    """Return the map relative to an origin [2]; z is 0. A :class:`DataError` says if no area can be formed of its
+    lanes.
     """
     ways = lane_lanelets(source)
     lanes = [

@@ -197,9 +197,8 @@ def cut_ends(bounds: Sequence[tuple[Doubles, Doubles]], links: Links) -> Doubles
 
 
 def opened(rings: Sequence[Doubles], cuts: Doubles) -> list[Doubles]:
-    """Return closed rings [P, 2] without their edges along cuts [N, 2, 2], in the same direction.
-
-    Traffic goes on beyond a cut, so that as road boundary it would put all of it off the road.
+    """Return closed rings [P, 2] without their edges along cuts [N, 2, 2], in the same direction. Traffic goes on
+    beyond a cut, so that as road boundary it would put all of it off the road.
     """
     lines = shapely.linestrings(cuts) if len(cuts) else np.zeros(0, object)
     tree = shapely.STRtree(lines)

@@ -115,9 +115,8 @@ class _Plain(pickle.Unpickler):
 
 
 def load_plain(path: Path) -> Any:
-    """Read a pickle of plain data; its arrays are :class:`Array`.
-
-    A :class:`DataError` names what is too large, empty, cut short, damaged, or anything else that it refers to.
+    """Read a pickle of plain data; its arrays are :class:`Array`. A :class:`DataError` names what is too large,
+    empty, cut short, damaged, or anything else that it refers to.
     """
     data = read_whole(path, MAX_BYTES)
     try:

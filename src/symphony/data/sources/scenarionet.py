@@ -141,9 +141,8 @@ def _text(value: Any) -> str:
 
 
 def _numbers(value: Array, name: str, steps: Any, width: int) -> Doubles:
-    """Return [T, width] from an array of numbers [T, width], or [T] for a width of 1; refuse any other.
-
-    More numbers than one a step may be followed by others: a height, where only x and y are asked for.
+    """Return [T, width] from an array of numbers [T, width], or [T] for a width of 1; refuse any other. More numbers
+    than one a step may be followed by others: a height, where only x and y are asked for.
     """
     found = value.value
     columns = found.shape[1] if found.ndim == 2 else 2 - found.ndim
@@ -282,9 +281,8 @@ def _neighbors(lanes: Sequence[Lane], areas: Sequence[Doubles | None]) -> tuple[
 
 
 def _side(one: Doubles, two: Doubles) -> int:
-    """Return 1 if the second line runs along on the left of the first, -1 on its right, else 0.
-
-    At the middle of the shorter one they must be :data:`BESIDE` apart and run the same way.
+    """Return 1 if the second line runs along on the left of the first, -1 on its right, else 0. At the middle of the
+    shorter one they must be :data:`BESIDE` apart and run the same way.
     """
     both = [shapely.LineString(line[:, :2]) for line in (one, two)]
     short, long = sorted(both, key=lambda line: line.length)
@@ -325,9 +323,8 @@ def _width(line: Doubles, outline: Doubles | None) -> float:
 def _rings(
     lanes: Sequence[Lane], areas: Sequence[Doubles | None], outlines: Sequence[Doubles]
 ) -> tuple[Doubles, ...]:
-    """Return rings around the outlined areas, where one inside another is a hole, and those of lanes.
-
-    Without outlines, lanes that have no area are :data:`HALF_WIDTH` wide on either side.
+    """Return rings around the outlined areas, where one inside another is a hole, and those of lanes. Without
+    outlines, lanes that have no area are :data:`HALF_WIDTH` wide on either side.
     """
     try:
         area = shapely.Polygon()

@@ -135,9 +135,8 @@ def log_likelihoods(features: WosacFeatures, config: WosacConfig) -> dict[str, T
 def histogram_log_likelihood(
     log: Float[Tensor, "E T"], simulated: Float[Tensor, "R E T"], bins: tuple[float, float, int]
 ) -> Float[Tensor, "E T"]:
-    """Return ln of the share of an object's simulated values, smoothed, in the bin of the logged value.
-
-    Every simulated value counts, also at steps at which the log is not valid.
+    """Return ln of the share of an object's simulated values, smoothed, in the bin of the logged value. Every
+    simulated value counts, also at steps at which the log is not valid.
     """
     objects = torch.arange(len(log))[:, None]
     counts = torch.zeros(len(log) * bins[2])
@@ -169,9 +168,8 @@ def flag_log_likelihood(log: Bool[Tensor, " E"], simulated: Bool[Tensor, "R E"])
 
 
 def speed_mask(valid: Bool[Tensor, "*batch T"]) -> Bool[Tensor, "*batch T"]:
-    """Return where the steps before and after are valid; the step itself need not be. False at both ends.
-
-    Applied to itself it is the mask of the acceleration.
+    """Return where the steps before and after are valid; the step itself need not be. False at both ends. Applied to
+    itself it is the mask of the acceleration.
     """
     result = torch.zeros_like(valid)
     result[..., 1:-1] = valid[..., 2:] & valid[..., :-2]

@@ -58,7 +58,6 @@ def cut_segments(
     name: str, network: Network, traffic: Traffic, rng: np.random.Generator, rule: CropRule
 ) -> tuple[list[RunSegment], Counter[str]]:
     """Cut segments, one ego each, from windows that do not overlap at each focus; also say why windows gave none.
-
     Segments of one focus share one :class:`RoadMap` object and one origin.
     """
     tracks, wild = _at_steps(traffic)

@@ -286,9 +286,8 @@ def grid(rng: Random, folder: Path) -> Path:
 
 
 def freeway(rng: Random, folder: Path, longer: float = 0.0) -> Path:
-    """Make two carriageways, each with an on-ramp and an off-ramp: apart or joined by a weaving lane.
-
-    All ends, those of the ramps too, are ``longer`` metres farther out than :data:`RAMP_RADIUS` asks for.
+    """Make two carriageways, each with an on-ramp and an off-ramp: apart or joined by a weaving lane. All ends, those
+    of the ramps too, are ``longer`` metres farther out than :data:`RAMP_RADIUS` asks for.
     """
     net = PlainNetwork()
     width = rng.uniform(3.5, 3.75)

@@ -55,9 +55,8 @@ class Network:
         return [edge for edge in range(len(lanes)) if lanes[edge] > 0 and edge not in entered]
 
     def edge_graph(self) -> tuple[list[list[int]], Doubles, NDArray[np.int64]]:
-        """Return for each edge outside junctions the edges that follow, its length and its number of lanes.
-
-        Edges inside junctions have no followers, length 0 and 0 lanes.
+        """Return for each edge outside junctions the edges that follow, its length and its number of lanes. Edges
+        inside junctions have no followers, length 0 and 0 lanes.
         """
         count = len(self.edge_names)
         following: list[set[int]] = [set() for _ in range(count)]

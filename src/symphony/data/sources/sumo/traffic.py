@@ -151,9 +151,8 @@ def simulate_traffic(
     *,
     sublane: bool,
 ) -> Traffic:
-    """Simulate what :func:`write_demand` wrote, record from ``warm_up`` to ``duration`` seconds and smooth.
-
-    Vehicles keep a lateral offset of their own from the centre of the lane that drifts with the distance driven.
+    """Simulate what :func:`write_demand` wrote, record from ``warm_up`` to ``duration`` seconds and smooth. Vehicles
+    keep a lateral offset of their own from the centre of the lane that drifts with the distance driven.
     """
     folder = network_file.parent
     events = [
