@@ -460,7 +460,8 @@ def test_missing_and_odd_values_are_tolerated(tmp_path: Path) -> None:
     np.testing.assert_array_equal(curves["auc"], [[1, 2, 3], [nan, nan, 0.5]])
     assert plot_curves({"odd": odd}, tmp_path / "odd.svg").axes[0].lines[1].get_marker() == "o"
     many = {"many": records(ttc_p5=1.0, ttc_p25=2.0, ttc_p50=3.0, ttc_p75=4.0)}
-    assert len(plot_curves(many, tmp_path / "many.svg").axes[0].lines) == 8
+    (axes, *_) = plot_curves(many, tmp_path / "many.svg").axes
+    assert (len(axes.lines), len(axes.get_legend().get_texts())) == (8, 4)
 
 
 @settings(deadline=None, max_examples=25)
