@@ -12,7 +12,8 @@ from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDict
 from tensordict.nn.distributions import NormalParamExtractor
 from torch import nn
 from torch.distributions import Normal
-from torchrl.modules import IndependentNormal
+from torchrl.envs import InitTracker, PendulumEnv
+from torchrl.modules import GRUModule, IndependentNormal
 
 from helpers_collectors import STREAM, Mass, Walk, X, starts
 from helpers_collectors import noise as hashed
@@ -247,6 +248,26 @@ def test_it_keeps_the_contract_of_torchrl(agents, arguments):
     td = starts(Walk(agents), 5, branches=1)[:, 0]
     td[VALID] = torch.ones(5, agents, dtype=torch.bool)
     check_contract(lambda **more: walkers(agents, use_mask=True, **{**arguments, **more}), td, 4)
+
+
+def test_an_actor_with_memory_acts_as_in_a_rollout():
+    torch.manual_seed(0)
+    memory = GRUModule(input_size=1, hidden_size=4, in_key="seen", out_key="h")
+    seen = TensorDictModule(lambda speed: speed[..., None], in_keys=["thdot"], out_keys=["seen"])
+    narrow = TensorDictModule(lambda mean: (mean, 0 * mean + 1e-9), in_keys=["mean"], out_keys=["loc", "scale"])
+    policy = ProbabilisticTensorDictSequential(
+        seen, memory, TensorDictModule(nn.Linear(4, 1), in_keys=["h"], out_keys=["mean"]), narrow,
+        ProbabilisticTensorDictModule(["loc", "scale"], ["action"], distribution_class=IndependentNormal),
+    )  # fmt: skip
+    env = with_rows(PendulumEnv(seed=0), [4])
+    env = env.append_transform(InitTracker()).append_transform(memory.make_tensordict_primer())
+    start = env.reset()
+    network = TensorDictModule(lambda speed: speed[..., None], in_keys=["thdot"], out_keys=["score"])
+    loss = MGAILLoss(policy, network, env, horizon=6, cost="logit", use_mask=False, reduction="none")
+    loss.set_keys(score="score")
+    found = loss(start)["loss_mgail"].squeeze(-1)
+    driven = env.rollout(6, policy, auto_reset=False, tensordict=start.clone(), break_when_any_done=False)
+    torch.testing.assert_close(found, driven["next", "thdot"])
 
 
 @pytest.mark.filterwarnings("ignore:The method <bound method TensorDictBase.__deepcopy__")

@@ -346,7 +346,8 @@ def test_runs_without_defined_progress_have_no_score(tmp_path: Path) -> None:
     lines = [re.split(r" *\| *", line)[2:5] for line in planners_text([other, record]).splitlines()[2:4]]
     assert lines == [["hurries", "100.0 ± 0.0", "2"], ["none", "–", "2"]]
     assert paired_difference(record, other) == (None, None, 0)
-    assert winners([other, record])[0].startswith("log: hurries is first, within the error, –")
+    assert winners([other, record])[0].startswith("log: hurries is first, its error unknown, –")
+    assert "is level with same" in winners([record, record | {"planner": "same"}])[0]
     # Ahead by 2.7 standard errors over four recordings, where Student's t of 3 degrees asks for 3.2.
     for one, ahead in ((record, (0.0112, 0.0512)), (other, (0.0, 0.0))):
         runs = [{"segment": f"{k}", "group": f"{k % 4}", "progress_ratio": 0.5 + ahead[k % 2]} for k in range(8)]

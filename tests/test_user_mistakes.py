@@ -203,6 +203,7 @@ def test_what_a_planner_does_wrong_ends_its_run_only(store: Path, told: Any, bod
     *((f"--planner exits{end}:plan", "SystemExit") for end in ("", ".py")),
     *((f"--planner wrong{end}:plan", "SyntaxError") for end in ("", ".py")),
     ("--search tree --rule math:sqrt", "can't be called as needed"), ("--device foo", "unknown device 'foo'"),
+    ("--device bar", "unknown device 'bar'"), ("--planner idm 3=", "'3=': names no planner"),
 ])  # fmt: skip
 def test_one_line_names_the_mistake(store: Path, told: Any, words: str, message: str) -> None:
     Path("exits.py").write_text("exit()\n")

@@ -161,7 +161,7 @@ def _ray(workers: int) -> Any:
         import ray  # noqa: PLC0415 (optional)
 
         if not ray.is_initialized():
-            ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING, **size)
+            ray.init(address=address or "local", log_to_driver=False, logging_level=logging.WARNING, **size)
     except ImportError as error:
         raise ConfigError("the engine 'ray' needs Ray: pip install 'symphony-traffic[ray]'") from error
     except (ConnectionError, ValueError, RuntimeError) as error:

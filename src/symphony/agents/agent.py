@@ -251,6 +251,7 @@ def load_agent(name: str, device: str = "cpu", *, trust_code: bool = False) -> A
         ConfigError: if there is no such agent, checkpoint or device, or the folder names code.
         CheckpointError: if its weights can't be read, or its networks are larger than they are.
     """
+    place = usable_device(device)
     if name == PLAYBACK:
         return Agent(name, None)
     if name in ("constant_velocity", "idm"):
@@ -269,7 +270,7 @@ def load_agent(name: str, device: str = "cpu", *, trust_code: bool = False) -> A
     load_checkpoint(checkpoint, modules=agent.modules, partial=True, restore_rng=False)
     for module in agent.modules.values():
         module.eval()
-    return agent.to(usable_device(device))
+    return agent.to(place)
 
 
 def _check_code(spec: AgentSpec, file: Path, trusted: bool) -> None:

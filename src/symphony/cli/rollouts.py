@@ -33,7 +33,7 @@ class Simulate(shared.Simulation):
     #: has 4 by default, or as many as its rollouts, if those are more.
     planner: Annotated[tuple[str, ...], arg(metavar="NAME [ID=NAME ...]")] = ()
     planner_seconds: float = 60.0  # Seconds that a planner has for one answer; a longer one fails the run.
-    #: Least number of runs (rollouts of a segment), spread evenly over segments; 0: `rollouts` of every segment.
+    #: Least number of runs (rollouts of a segment), as many of each segment used; 0: `rollouts` of every segment.
     runs: checks.Natural = 0
     #: Goals of agents, by their ids in the source: `7=lane:103` for a route over the lane of that id, `7=12.5,-40`
     #: for one that passes a point (metres, in the frame of the segment); all others as the agent draws them.

@@ -31,8 +31,7 @@ class AgentConfig(Settings):
     #: Nearest lights that the agent observes beside the points, however far they are (the paper: none).
     num_lights: Annotated[int, Bounds(0, MOST)] = 0
     #: Inputs of the policy. `paper`: objects and points around; `gaps`: also how far the agent is from the boxes of
-    #: objects, now and within the next 2 s if all keep speed and course, and with goals where they are along its
-    #: route.
+    #: objects, now and within 2 s if all keep speed and course, and with goals where they are along its route.
     features: Literal["paper", "gaps"] = "paper"
     #: Levels of acceleration, an odd number (methods bc*; the paper: 7).
     accelerations: Annotated[int, Bounds(1, 1001)] = 7

@@ -170,9 +170,8 @@ FUTURE, DT = 80, 0.1
 class WosacSettings(SimulationConfig):
     """Settings of the simulation; each of the 32 rollouts of a search comes from a tree of its own."""
 
-    #: Score that a search lowers. `agent`: as is best for the agent; `discriminator`: what the agent's own one calls
-    #: unreal; `rule`: collisions, also those within half a second if all keep speed and course, and time off the
-    #: road.
+    #: Score that a search lowers. `agent`: as is best for the agent; `discriminator`: what its own one calls unreal;
+    #: `rule`: collisions, also those within half a second if all keep speed and course, and time off the road.
     score: WosacScore = "agent"
     #: Share of the variance of an agent's draws that is drawn once for a whole rollout, as drivers differ in pace; 0:
     #: every step draws anew. That of logged drivers is .17 (simulated towns) and .32 (NGSIM).

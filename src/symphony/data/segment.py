@@ -151,8 +151,7 @@ class RoadMap:
     #: [E', 2] int32 (lane, the lane on its left that a lane change may reach, same direction)
     left_neighbors: Ints
     right_neighbors: Ints  # [E'', 2] int32 (lane, the one on its right)
-    #: edge of the drivable area, *oriented: the drivable side is on the left*. Closed rings repeat their
-    #: first point.
+    #: edge of the drivable area, *oriented: the drivable side is on the left*. Closed rings repeat their first point.
     boundary: Polylines
     marks: Polylines  # other features (lines, crosswalks, stop signs; a sign is a line of one point)
     mark_type: Ints  # [K] uint8, :class:`MarkType`

@@ -163,10 +163,11 @@ def winners(records: Sequence[Record]) -> list[str]:
         clear = error is not None and (difference or 0.0) > t_quantile(0.975, groups - 1) * error
         by = "–" if difference is None else f"{difference:.1f}"
         by += "" if error is None else f" ± {error:.1f}"
-        verb = "wins" if clear else "is first, within the error"
+        unsure = "is first, within the error" if error is not None else "is first, its error unknown"
+        verb = "is level with" if difference == 0 else f"{'wins' if clear else unsure}, {by} above"
         one, two = _scores(first).keys(), _scores(second).keys()
         where = "" if one == two else f", in the {len(one & two)} segments that both drove"
-        found.append(f"{crowd}: {planner_title(first)} {verb}, {by} above {planner_title(second)}{where}")
+        found.append(f"{crowd}: {planner_title(first)} {verb} {planner_title(second)}{where}")
     return found
 
 

@@ -47,8 +47,7 @@ class GoalLoss(MaskedLoss):
             logits (NestedKey): float `[..., N, G]`, as the network writes them.
             mask (NestedKey): bool `[..., N, G]`, True where a goal is feasible.
             label (NestedKey): int64 `[..., N]`, the expert's goal, -1 for none.
-            label_set (NestedKey): bool `[..., N, G]`, optional: equally right goals; where it is present, the label
-                is not read.
+            label_set (NestedKey): bool `[..., N, G]`, optional: equally right goals, read instead of the label.
             valid (NestedKey): bool `[..., N]`, True where an agent counts.
         """
 

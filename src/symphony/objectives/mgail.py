@@ -15,6 +15,7 @@ from torch.func import functional_call
 from torch.nn import functional
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import set_recurrent_mode
 
 from symphony.objectives.base import MaskedLoss, Reduction
 from symphony.programs import compiled, ordered
@@ -175,7 +176,9 @@ class MGAILLoss(MaskedLoss):
         frozen = {name: weight.detach() for name, weight in self.discriminator.named_parameters()}
         step = compiled(_step, env, self.compile_step) if self.compile_step else _step
         written = [key for key in env.action_keys if key not in self.actor_network.in_keys]
-        with self.actor_network_params.to_module(self.actor_network), set_exploration_type(ExplorationType.RANDOM):
+        # In a loss, networks with memory take a batch for a time axis; here they act step by step.
+        acting = set_exploration_type(ExplorationType.RANDOM), set_recurrent_mode(False)
+        with self.actor_network_params.to_module(self.actor_network), acting[0], acting[1]:
             for t in range(steps):
                 if self.truncate and t % self.truncate == 0:
                     now = now.detach()
@@ -203,6 +206,8 @@ def _step(
     acting = loss.actor_network(acting)
     for key in env.action_keys:
         drawn.set(key, acting.get(key))
+    if (memory := acting.get("next", None)) is not None:
+        drawn.set("next", memory)
     now = env.step_mdp(env.step(drawn))
     score = functional_call(loss.discriminator, frozen, (now.copy(),)).get(names.score, default=None)
     if score is None:

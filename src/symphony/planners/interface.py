@@ -219,7 +219,7 @@ def planner_maker(planner: str | Callable[..., Any]) -> Callable[[], Planner]:
         raise ConfigError(f"planner '{name}' can't be made: {type(error).__name__}: {error}") from error
     missing = [part for part in ("reset", "plan") if not callable(getattr(made, part, None))]
     if missing and not (isinstance(made, IDMPlanner) and len(missing) == 2):
-        raise ConfigError(f"planner '{name}' has no {' and no '.join(missing)}")
+        raise ConfigError(f"planner '{name}' has no {' and no '.join(missing)}, and isn't a function of one argument")
     return given
 
 
@@ -235,7 +235,8 @@ def named_planners(words: Sequence[str]) -> tuple[str, dict[int, str]]:
         if not agent.removeprefix("-").isdecimal():
             egos.append(word)
         elif others.setdefault(int(agent), name) != name or not name:
-            raise ConfigError(f"planner '{word}': agent {agent} already has another one")
+            wrong = f"agent {agent} already has another one" if name else "names no planner, as in 3=idm"
+            raise ConfigError(f"planner '{word}': {wrong}")
     if len(egos) > 1 or (others and not egos):
         told = f"{len(egos)} are named: {', '.join(egos)}" if egos else "there is none (`log` plays back its log)"
         raise ConfigError(f"the ego has one planner, {told}; name another agent's by its id, as in 3=idm")
