@@ -115,7 +115,7 @@ data convert womd x --out y --interactive -3
 data convert womd x --out y --radius nan
 data convert interaction x --out y --stride 0
 data generate --out y --preset town --seed 1
-data generate --out y --count 1 --kinds random => (known: town, grid, ramp, and files of roads
+data generate --out y --count 1 --kinds random => (known: town, grid, ramp, street, and files of roads
 train bc --data x --out y --steps many
 train bc --data x --out y --steps 0
 evaluate --data x

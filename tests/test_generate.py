@@ -266,7 +266,7 @@ RULE = sumo.CropRule(focuses=3, per_focus=4)
 @pytest.fixture(scope="module")
 def simulated() -> dict[str, list[RunSegment]]:
     """Short runs of every kind; seeds with lights, roundabouts and stop signs among them."""
-    runs = (("town", 3), ("grid", 1), ("ramp", 1))
+    runs = (("town", 3), ("grid", 1), ("ramp", 1), ("street", 1))
     return {f"{kind}-{seed}": sumo.generate_run(kind, seed, 45.0, rule=RULE)[0] for kind, seed in runs}
 
 
@@ -284,6 +284,21 @@ def ends(road: RoadMap) -> tuple[NDArray[Any], NDArray[Any]]:
     """First and last point [L, 2] of every lane."""
     points, offsets = road.lanes.points[:, :2], road.lanes.offsets
     return points[offsets[:-1]], points[offsets[1:] - 1]
+
+
+@needs_sumo
+def test_cars_at_the_kerb_stand_partly_on_lanes_and_others_pass_them(simulated: dict[str, list[RunSegment]]) -> None:
+    found = {"town-3": [0, 0], "street-1": [0, 0]}
+    for name, counts in found.items():
+        for s in simulated[name]:
+            edges = shapely.union_all([shapely.linestrings(line[:, :2]) for line in s.road.boundary])
+            on_road = s.size[:, 1] / 2 - shapely.distance(edges, shapely.points(s.position[:, 0, :2]))
+            parked = s.valid.all(1) & (np.ptp(s.position, axis=1).max(1) == 0) & (on_road > -0.3) & (on_road < 1.1)
+            moving = travel(s) > MOVING
+            away = np.linalg.norm(s.position[parked, None] - s.position[None, moving], axis=-1)
+            counts[:] = counts[0] + parked.sum(), counts[1] + ((away < 3.0) & s.valid[moving]).any((1, 2)).sum()
+    assert found["town-3"] == [0, 0]
+    assert (np.array(found["street-1"]) > [40, 6]).all()
 
 
 def test_segments_conform_and_keep_the_exclusions(driven: list[RunSegment]) -> None:

@@ -64,8 +64,7 @@ def choose(folder: Path, which: str = "") -> Path:
     """Return the checkpoint of a run that ``which`` names: the ``best``, the ``last``, or that of a step such as
     ``3000`` or ``step-3000``; by default the best, which the last one knows, if the run was validated, else the last.
 
-    Raises a :class:`ConfigError` if there is no such checkpoint, a :class:`CheckpointError` if the last one can't be
-    read.
+    Raises a :class:`ConfigError` if there is no such checkpoint, a :class:`CheckpointError` if the last is damaged.
     """
     from symphony.agents.checkpoint import CheckpointError, checkpoints  # noqa: PLC0415
 

@@ -61,8 +61,7 @@ class DiscriminatorConfig(Settings):
     features: Features = "clearance"
     #: Width of the discriminator's encoders; its head is twice as wide.
     hidden: Annotated[Size, Suppress] = 32
-    #: Discriminator: `paper`, or the import path of a function from an `AgentSpec` to a module that writes one logit
-    #: per agent.
+    #: Discriminator: `paper`, or the import path of a function from an `AgentSpec` to a module that writes logits.
     network: Own = "paper"
 
 

@@ -121,8 +121,7 @@ class EvaluateConfig(SimulationConfig):
     #: Run segments simulated at a time (changes memory, speed and rounding); 0: up to 64, or 16 with a planner, on
     #: a card up to 1 024, fewer where their agents see many points.
     batch: Natural = 0
-    #: Engine that runs the worker processes: `local`, on this machine, or `ray`, on a Ray cluster (at RAY_ADDRESS,
-    #: else one is started here).
+    #: Engine that runs the worker processes: `local`, or `ray`, on the cluster at RAY_ADDRESS or one started here.
     engine: Engine = "local"
     #: Compile the steps of simulations, which takes minutes: `auto`, on a device where a run is long enough to win.
     compile: Compile = "auto"

@@ -36,8 +36,7 @@ class MGAILConfig(Settings):
     #: road (0: none, as in the paper).
     regression: Natural = 2700
     head_start: Natural = 30  # Updates of the discriminator alone after those of regression.
-    #: Rollouts per update that the gradient goes through, drawn from those of the last search; all of them, if it has
-    #: fewer.
+    #: Rollouts per update that the gradient goes through, drawn from those of the last search (at most all of them).
     rollouts: Count = 16
     #: Learning rate of the policy's Adam in the adversarial updates, falling to a tenth along a cosine.
     learning_rate: Positive = 2e-4

@@ -159,7 +159,7 @@ class RolloutMetrics:
         after a step, and whether its centre is off the road, which nobody is where the map has no boundary
         (``bounded``). Speeds are in m/s, ``last`` numbers the last step of each segment, ``kinds`` [B, K, N] are
         first collisions, those logged while their log exists. ``curvature`` is the average curvature of every
-        branching region visited by each rollout of a segment, and by the log; ``choices`` what a search made of goals.
+        branching region that rollouts of a segment visit, and the log; ``choices`` what the search made of the goals.
         """
         # Sums are exact, so that padding among what is summed does not change how they are rounded.
         away = displacement.double().masked_fill(~(simulated & logged[:, None]), 0.0).flatten(2).tolist()

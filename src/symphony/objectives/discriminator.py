@@ -154,11 +154,7 @@ class DiscriminatorLoss(MaskedLoss):
 
 
 def _squared_norm(
-    logit: Float[Tensor, "*b"],
-    leaves: list[Float[Tensor, "*_"]],
-    where: Bool[Tensor, "*b"],
-    *,
-    create_graph: bool,
+    logit: Float[Tensor, "*b"], leaves: list[Float[Tensor, "*_"]], where: Bool[Tensor, "*b"], *, create_graph: bool
 ) -> Float[Tensor, "*b"]:
     """Return the squared norm `[..., N]` of each logit's gradient with respect to its own entry's inputs."""
     total = torch.where(where, logit, 0.0).sum()

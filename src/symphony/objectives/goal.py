@@ -65,11 +65,7 @@ class GoalLoss(MaskedLoss):
     target_goal_network_params: TensorDictParams
 
     def __init__(
-        self,
-        goal_network: TensorDictModuleBase,
-        *,
-        reduction: Reduction | None = None,
-        use_mask: bool | None = None,
+        self, goal_network: TensorDictModuleBase, *, reduction: Reduction | None = None, use_mask: bool | None = None
     ) -> None:
         super().__init__(reduction, use_mask)
         self.convert_to_functional(goal_network, "goal_network")

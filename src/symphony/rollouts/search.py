@@ -149,12 +149,7 @@ def pruning_noise(seed: int) -> Callable[[TensorDictBase, int], Tensor]:
 
 
 def collector_settings(
-    config: SearchConfig,
-    env: DrivingEnv,
-    seed: int,
-    data: SceneDataset,
-    segments: int,
-    rule: PruningRule,
+    config: SearchConfig, env: DrivingEnv, seed: int, data: SceneDataset, segments: int, rule: PruningRule
 ) -> dict[str, Any]:
     """Return settings that a collector of driving needs beside environment, policy and scores: trees of ``segments``
     run segments at a time, which a ``rule`` prunes, and random numbers of seed, segment, branch and step alone.

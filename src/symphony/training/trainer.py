@@ -56,18 +56,7 @@ ALARMS = {
     "records): its scores are chance; consider a higher rate, or more features or states for it",
 }
 """Values that `alarm` in the metrics may have, and what they mean."""
-FREE = (
-    "out",
-    "data",
-    "steps",
-    "resume",
-    "device",
-    "wandb",
-    "preview",
-    "checkpoint_every",
-    "log_every",
-    "compile",
-)
+FREE = ("out", "data", "steps", "resume", "device", "wandb", "preview", "checkpoint_every", "log_every", "compile")
 """Settings that may change when a run goes on: more updates or another machine do not make another run."""
 _SEED_STRIDE = 1_000_003
 

@@ -110,8 +110,7 @@ def map_path(path: Path) -> Path:
 def read_columns(data: bytes) -> Columns:
     """Return the columns the reader needs, as arrays [N].
 
-    A :class:`DataError` says if the file is not Parquet or too large, or a column is missing, of another type, or has
-    gaps.
+    A :class:`DataError` says if the file is not Parquet or too large, or a column is missing, odd or has gaps.
     """
     import pyarrow as pa  # noqa: PLC0415 - an optional extra
     from pyarrow import parquet  # noqa: PLC0415

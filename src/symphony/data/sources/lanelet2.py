@@ -273,9 +273,7 @@ def middle(source: LaneletMap) -> Doubles:
 
 
 def road_map(source: LaneletMap, origin: Doubles) -> RoadMap:
-    """Return the map relative to an origin [2]; z is 0. A :class:`DataError` says if no area can be formed of its
-    lanes.
-    """
+    """Return the map relative to an origin [2]; z is 0. A :class:`DataError` says if its lanes form no area."""
     ways = lane_lanelets(source)
     lanes = [
         Lane(

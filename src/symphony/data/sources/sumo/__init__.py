@@ -74,10 +74,11 @@ def generate_run(
             slow_bends(file)
         # On the user's own roads traffic comes from where streets begin at the edge of the map, and circulates.
         through = ramp or (own and bool(network.sources()))
-        sublane = bool(drive_rng.random() < SUBLANE_SHARE)
+        parked = kind == "street"
+        sublane = bool(drive_rng.random() < SUBLANE_SHARE) or parked
         warm_up = WARM_UP * (_OWN_FILLS if own else 1) + longer / _SLOW
         end = warm_up + duration
-        how = {"through": through, "around": not ramp, "sublane": sublane}
+        how = {"through": through, "around": not ramp, "sublane": sublane, "parked": parked}
         size = write_demand(network, demand_rng, folder, end, **how, straight=straight)
         traffic = simulate_traffic(file, network, size, drive_rng, end, warm_up, sublane=sublane)
     found, reasons = cut_segments(f"sumo-{kind_name(kind)}-{seed:06d}", network, traffic, cut_rng, rule)

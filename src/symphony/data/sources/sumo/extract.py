@@ -21,7 +21,7 @@ MAX_OVERLAP = 0.05
 MAX_ACCELERATION = 7.5
 MAX_YAW_RATE = 1.6
 MAX_LATERAL_SPEED = 1.5
-_EGO_TRAVEL = 8.0
+_EGO_TRAVEL, _STANDS = 8.0, 0.1
 _MIN_STEPS = 5
 _TURN, _NEAR, _SPEED_CHANGE = 0.5, 6.0, 4.0
 
@@ -132,7 +132,7 @@ def _cut(
     wild = bool((unphysical[agents, window] & valid).any())
     if wild or _overlap(position, heading, size, valid):
         return "unphysical motion" if wild else "overlap"
-    if not shapely.contains_xy(crop.drivable, *position[valid].T).all():
+    if not shapely.contains_xy(crop.drivable, *position[valid & (travel > _STANDS)[:, None]].T).all():
         return "off the road"
     ego = int(rng.choice(len(agents), p=weight / weight.sum()))
     lights = [tracks.lights[light][link, window] for light, link in crop.signals]

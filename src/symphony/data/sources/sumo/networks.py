@@ -419,5 +419,5 @@ def slow_bends(file: Path) -> None:
     tree.write(file)
 
 
-NETWORKS: dict[str, Callable[[Random, Path], Path]] = {"town": town, "grid": grid, "ramp": freeway}
+NETWORKS: dict[str, Callable[[Random, Path], Path]] = {"town": town, "grid": grid, "ramp": freeway, "street": town}
 """Kinds of network; each function writes files into a folder and returns the path of the network."""

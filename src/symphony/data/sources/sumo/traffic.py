@@ -5,6 +5,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET  # files are our own
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ _BODIES = (
     (0.07, (7.0, 9.5), (2.2, 2.45), (2.8, 3.6), "truck"),
     (0.03, (10.5, 12.0), (2.45, 2.55), (3.0, 3.4), "bus"),
 )
+_LONGEST_PARKED = 6.0  # metres
 _DRIVERS = ("IDM", "EIDM", "Krauss")
 TYPES = 24
 ROUTES = "traffic.rou.xml"
@@ -77,13 +79,15 @@ def write_demand(
     through: bool,
     around: bool,
     sublane: bool,
+    parked: bool = False,
     straight: float = 1.0,
 ) -> Floats:
     """Write vehicle types and vehicles, with routes that last ``duration`` seconds, into the file :data:`ROUTES`.
 
     If ``through``, traffic enters at the sources of the network during the whole run and leaves it at the end; if
-    ``around``, a fixed number of vehicles starts everywhere. A route is a random walk, at junctions ``straight``
-    times as likely to go straight on as to take any one turn. Returns the box [3] of each vehicle k (its id in SUMO).
+    ``around``, a fixed number of vehicles starts everywhere; if ``parked``, others stand at the kerb. A route is a
+    random walk, at junctions ``straight`` times as likely to go straight on as to take any one turn. Returns the box
+    [3] of each vehicle k (its id in SUMO).
     """
     types, sizes, shares = _types(rng, sublane)
     following, length, lanes = network.edge_graph()
@@ -112,7 +116,8 @@ def write_demand(
         places += ['departPos="random_free" departLane="best" departSpeed="speedLimit"'] * count
     order = np.argsort(departs, kind="stable")
     kinds = rng.choice(TYPES, len(order), p=shares)
-    lines = ["<routes>", *types]
+    standing, stood = _parked(network, rng, sizes, len(order)) if parked else ([], kinds[:0])
+    lines = ["<routes>", *types, *standing]
     for k, i in enumerate(order):
         at = starts[i]
         route, total = [at], float(length[at])
@@ -126,7 +131,27 @@ def write_demand(
             f'<route edges="{edges}"/></vehicle>'
         )
     (folder / ROUTES).write_text("\n".join([*lines, "</routes>"]))
-    return sizes[kinds]
+    return sizes[np.concatenate([kinds, stood])]
+
+
+def _parked(network: Network, rng: np.random.Generator, sizes: Floats, first: int) -> tuple[list[str], NDArray[Any]]:
+    """Return vehicles, numbered from ``first``, that stand partly on the lanes of most streets, and their types."""
+    lines, kinds, small = list[str](), list[int](), np.flatnonzero(sizes[:, 0] < _LONGEST_PARKED)
+    length = network.edge_graph()[1]
+    for edge in np.flatnonzero(length):
+        # Of the lanes of an edge the first is at the kerb, which in networks of our own is on the right.
+        kerb, lane = network.width[np.argmax(network.edge == edge)] / 2, network.edge_names[edge]
+        places = np.arange(12.0 + rng.uniform(0, 10), length[edge] - 15, 6.5)
+        for at in places[rng.random(len(places)) < rng.uniform(-0.3, 0.8)]:
+            kind = int(rng.choice(small))
+            aside = kerb + sizes[kind, 1] / 2 - rng.uniform(0.1, 0.8)
+            lines.append(
+                f'<vehicle id="{first + len(kinds)}" type="t{kind}" depart="0" departPos="stop" departLane="0">'
+                f'<route edges="{lane}"/><stop lane="{lane}_0" startPos="{at:.2f}" posLat="{-aside:.2f}" '
+                f'endPos="{at + sizes[kind, 0]:.2f}" duration="100000"/></vehicle>'
+            )
+            kinds.append(kind)
+    return lines, np.asarray(kinds, np.int64)
 
 
 @dataclass(frozen=True)
