@@ -80,6 +80,7 @@ def ring(seed: int, agents: int = AGENTS, points: int = POINTS, steps: int = 11)
         "point_light": np.full(points, -1),
         "point_valid": np.ones(points),
         "light": np.zeros((steps, 0)),
+        "light_end": np.zeros((0, 2)),
         "edge_start": start,
         "edge_end": end,
         "edge_previous": np.concatenate([(k - 1) % half, half + (k - 1) % half]),

@@ -252,17 +252,16 @@ def test_it_keeps_the_contract_of_torchrl(agents, arguments):
 
 def test_an_actor_with_memory_acts_as_in_a_rollout():
     memory = GRUModule(input_size=1, hidden_size=4, in_key="seen", out_key="h")
-    seen = TensorDictModule(lambda speed: speed[..., None], in_keys=["thdot"], out_keys=["seen"])
+    column = lambda key: TensorDictModule(lambda x: x[..., None], in_keys=["thdot"], out_keys=[key])  # noqa: E731
     narrow = TensorDictModule(lambda mean: (mean, 0 * mean + 1e-9), in_keys=["mean"], out_keys=["loc", "scale"])
     policy = ProbabilisticTensorDictSequential(
-        seen, memory, TensorDictModule(nn.Linear(4, 1), in_keys=["h"], out_keys=["mean"]), narrow,
+        column("seen"), memory, TensorDictModule(nn.Linear(4, 1), in_keys=["h"], out_keys=["mean"]), narrow,
         ProbabilisticTensorDictModule(["loc", "scale"], ["action"], distribution_class=IndependentNormal),
     )  # fmt: skip
     env = with_rows(PendulumEnv(seed=0), [4])
     env = env.append_transform(InitTracker()).append_transform(memory.make_tensordict_primer())
     start = env.reset()
-    network = TensorDictModule(lambda speed: speed[..., None], in_keys=["thdot"], out_keys=["score"])
-    loss = MGAILLoss(policy, network, env, horizon=6, cost="logit", use_mask=False, reduction="none")
+    loss = MGAILLoss(policy, column("score"), env, horizon=6, cost="logit", use_mask=False, reduction="none")
     loss.set_keys(score="score")
     driven = env.rollout(6, policy, auto_reset=False, tensordict=start.clone(), break_when_any_done=False)
     torch.testing.assert_close(loss(start)["loss_mgail"].squeeze(-1), driven["next", "thdot"])

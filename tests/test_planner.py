@@ -515,23 +515,27 @@ def test_idm_keeps_its_lane_in_turns() -> None:
     assert np.abs(turned * found[1:, 3]).max() < 4.0
 
 
-def at_a_light(mine: SignalState, others: SignalState) -> RunSegment:
-    """A car 12 m before a crossing without limits, its own light in one state, those of its approach in another."""
+def at_a_light(mine: SignalState, others: SignalState, larger: float = 1) -> RunSegment:
+    """A car 12 m before a left turn without limits, its own light in one state, those of its approach in another."""
     segment = crossing(2, steps=61, seed=0).replace(ego=1)
     path = LineString(segment.position[1, :, :2])
     state = np.full_like(segment.signal_state, others)
     leads = [path.distance(Point(segment.road.lanes[int(lane)][6, :2])) < 0.3 for lane in segment.signal_lane]
-    assert sum(leads) == 1
     state[leads] = mine
     segment.road.speed_limit[:] = np.nan
-    return segment.replace(signal_state=state)
+    segment.road.lanes.points[:, :2] *= larger
+    powers = {"position": 1, "signal_point": 1, "velocity": 0.5, "dt": 0.5}
+    return segment.replace(signal_state=state, **{n: getattr(segment, n) * larger**k for n, k in powers.items()})
 
 
-def test_idm_stops_at_its_own_red_light_alone() -> None:
+@pytest.mark.parametrize("larger", [1, 4])
+def test_idm_stops_at_its_own_red_light_alone(larger: float) -> None:
     stop, go = SignalState.STOP, SignalState.GO
-    red, free, passed, late = (at_a_light(*pair) for pair in ((stop, go), *3 * [(go, stop)]))
+    red, free, passed, late = (at_a_light(*pair, larger) for pair in ((stop, go), *3 * [(go, stop)]))
     passed.signal_state[:, 30:], late.signal_state[:, 5:] = stop, SignalState.CAUTION  # too late to stop for
-    path, *others = states(red, free, passed, late)
+    on_approach = red.replace(signal_lane=(red.signal_lane - 8) // 3)  # a light at the end of its lane
+    path, same, *others = states(red, on_approach, free, passed, late)
+    np.testing.assert_array_equal(path, same)
     stop = np.linalg.norm(red.signal_point[:, :2] - path[-1, :2], axis=-1).min()
     assert path[-1, 3] < 0.1
     assert 0.5 * LENGTH < stop < 0.5 * LENGTH + 4

@@ -161,6 +161,7 @@ class SceneBatch(TensorClass):
     point_light: Tensor  # [P] int16 row of Q for lights, else -1
     point_valid: Tensor  # [P]
     light: Tensor  # [T, Q] uint8, SignalState
+    light_end: Tensor  # [Q, 2] end of the lane that each controls
     edge_start: Tensor  # [E, 2] boundary segments, the drivable side on their left
     edge_end: Tensor  # [E, 2]
     edge_previous: Tensor  # [E] int32 segment that ends where this one starts, -1 if none
@@ -378,6 +379,7 @@ def _points(segment: RunSegment, levels: Levels) -> dict[str, NDArray[Any]]:
         "point_speed": speed.astype(np.float32),
         "point_light": light.astype(np.int16),
         "point_valid": np.ones(len(light), bool),
+        "light_end": ends.reshape(-1, 2),
     }
 
 

@@ -17,8 +17,8 @@ VIEW = 100.0
 """Metres ahead within which the route's bends and limits, and other agents, count."""
 BACK = 5.0
 """Metres of the route behind a place within which it is sought."""
-AT_STOP, STOP_CHORD = 1.5, 15.0
-"""Metres of a stop point from a route that it is on, and metres behind it for which the route follows its lane."""
+AT_STOP = 1.5
+"""Metres of a stop point from a route that it is on."""
 
 
 class LogPlanner:

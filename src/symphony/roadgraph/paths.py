@@ -18,7 +18,7 @@ GENTLE = 0.09  # radians that a lane turns from one such piece to the next where
 _STEP = 1.0  # metres between the points of a blend
 _SMOOTH = 1.5
 """Metres to either side over which the direction of a line is taken when something is moved beside it."""
-_CLOSE = 1e-6  # metres between points that are one
+CLOSE = 1e-6  # metres between points that are one
 _JOINED = 0.02  # metres between two lanes that meet
 _JOIN = 6.0
 """Metres along for a metre to the side, where a lane does not begin exactly where the one before it ends."""
@@ -43,7 +43,7 @@ def blend(line: Reals, point: Reals, length: float) -> Reals:
     if begin >= arc[-1]:
         return point[None]
     end = min(begin + max(length, _STEP), arc[-1])
-    places = np.append(np.arange(begin, end - _CLOSE, _STEP), end)
+    places = np.append(np.arange(begin, end - CLOSE, _STEP), end)
     ahead, behind = (at(line, arc, places + shift) for shift in (_SMOOTH, -_SMOOTH))
     way = ahead - behind
     normal = np.stack([-way[:, 1], way[:, 0]], -1) / np.hypot(*way.T)[:, None]
@@ -53,7 +53,7 @@ def blend(line: Reals, point: Reals, length: float) -> Reals:
     fades = 1.0 - share * share * (3.0 - 2.0 * share)
     moved = on + (aside * fades)[:, None] * normal
     moved[0] = point
-    return np.concatenate([moved, line[arc > end + _CLOSE]])
+    return np.concatenate([moved, line[arc > end + CLOSE]])
 
 
 def beside(line: Reals, point: Reals) -> tuple[float, float]:
@@ -102,13 +102,13 @@ def centre_line(graph: LaneGraph, lanes: Sequence[int], start: float = 0.0) -> R
     """Return the line [P, 2] along lanes, each the successor of the last, from ``start`` metres on the first."""
     first, arc = graph.lines[lanes[0]], graph.arc[lanes[0]]
     start = min(max(start, 0.0), float(arc[-1]))
-    parts = [at(first, arc, np.array([start])), first[arc > start + _CLOSE]] if start > 0.0 else [first]
+    parts = [at(first, arc, np.array([start])), first[arc > start + CLOSE]] if start > 0.0 else [first]
     return np.concatenate([*parts, *(followed(graph, before, lane) for before, lane in pairwise(lanes))])
 
 
 def distinct(line: Reals) -> Reals:
     """Return a line without points that lie on the one before."""
-    return line[np.concatenate(([True], np.hypot(*np.diff(line, axis=0).T) > _CLOSE))]
+    return line[np.concatenate(([True], np.hypot(*np.diff(line, axis=0).T) > CLOSE))]
 
 
 def sharpest(line: Reals, spacing: float = 0.5) -> float:

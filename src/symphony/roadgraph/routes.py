@@ -148,11 +148,11 @@ def _change_at(graph: LaneGraph, lane: int, other: int, start: float) -> tuple[f
     """
     line, target = graph.lines[lane], graph.lines[other]
     begins = max(start, paths.beside(line, target[0])[0])
-    if begins >= graph.length[lane]:
+    if begins > graph.length[lane] - paths.CLOSE:
         return None
     point = paths.at(line, graph.arc[lane], np.array([begins]))[0]
     onto, away = paths.beside(target, point)
-    if onto >= graph.length[other] or away > CHANGE_WIDTH:
+    if onto > graph.length[other] - paths.CLOSE or away > CHANGE_WIDTH:
         return None
     headings = []
     for number, place in ((lane, begins), (other, max(onto, 0.0))):

@@ -187,23 +187,22 @@ def _limits(scenes: SceneBatch, points: Tensor, unknown: float) -> Float[Tensor,
 
 def _stops(scenes: SceneBatch, lines: _Lines) -> Float[Tensor, "B N Q"]:
     """Return metres along the routes at which lights stop them. A light is on a route if its stop point is; of
-    several at one, that whose lane leads nearest to the route's way.
+    several at one, that whose lane ends nearest to the route.
     """
     out = torch.full((*lines.arc.shape[:2], scenes.light.shape[2]), torch.inf, device=lines.arc.device)
     for b in range(len(scenes)):
         which = (scenes.point_light[b] >= 0).nonzero()[:, 0]
         if not len(which):
             continue
-        point, way = scenes.point[b, which], scenes.point_direction[b, which]
+        light, point = scenes.point_light[b, which].long(), scenes.point[b, which]
         line = _Lines(*(part[b] for part in lines))
-        station, aside, _ = _project(line, point.expand(len(line.arc), -1, -1))
-        beyond = torch.stack([_at(line, column + included.STOP_CHORD) for column in station.unbind(1)], 1)
-        along = (normalize(beyond - point, dim=-1, eps=1e-6) * way).sum(-1)
-        along = along.masked_fill((aside.abs() > included.AT_STOP) | (station < -5.0), -torch.inf)
+        places = (each.expand(len(line.arc), -1, -1) for each in (point, scenes.light_end[b, light]))
+        (station, aside, _), (end, away, _) = (_project(line, each) for each in places)
+        mine = (aside.abs() <= included.AT_STOP) & (station >= -5.0) & (end > station - 1.0)
+        away = away.abs().masked_fill(~mine, torch.inf)
         same = (point[:, None] - point[None]).norm(dim=-1) < 1.0
-        best = torch.where(same, along[:, None, :], -torch.inf).amax(-1)
-        mine = (along > 0.0) & (along >= best)
-        out[b][:, scenes.point_light[b, which].long()] = torch.where(mine, station, torch.inf)
+        mine &= away <= torch.where(same, away[:, None, :], torch.inf).amin(-1)
+        out[b][:, light] = torch.where(mine, station, torch.inf)
     return out
 
 
