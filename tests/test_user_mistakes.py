@@ -199,7 +199,7 @@ def test_what_a_planner_does_wrong_ends_its_run_only(store: Path, told: Any, bod
 @pytest.mark.parametrize(("words", "message"), [
     ("--planner idm --planner-seconds inf", "planner-seconds must be above 0"),
     ("--planner pipe:'foo", "No closing quotation"), ("--planner idm --segments 0 0", "is named twice: 0, 0"),
-    ("--goal 7=3,4", "follows no goals"), ("--pace 0.5", "no learned agent"), ("--planner idm 3=", "names no planner"),
+    ("--goal 7=3,4", "follows no goals"), ("--pace 0.5", "no learned agent"), ("--planner idm 3=", "no planner, as"),
     *((f"--planner exits{end}:plan", "SystemExit") for end in ("", ".py")),
     *((f"--planner wrong{end}:plan", "SyntaxError") for end in ("", ".py")),
     ("--search tree --rule math:sqrt", "can't be called as needed"), ("--device foo", "unknown device 'foo'"),
