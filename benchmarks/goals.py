@@ -98,6 +98,7 @@ def main() -> None:
     if given.fresh:
         agent = replace(agent, goals=goal_network(agent.spec))
     agent.goals.requires_grad_(True)
+    given.out.mkdir(parents=True)
     parts, shown = first_states(agent, given.data), {str(d): first_states(agent, d) for d in given.validation}
     updates = -(-len(parts) // given.segments)
     optimizer = torch.optim.AdamW(agent.goals.parameters(), weight_decay=given.decay)
@@ -119,7 +120,6 @@ def main() -> None:
         if mean < best:
             best, kept = mean, deepcopy(agent.goals.state_dict())
     agent.goals.load_state_dict(kept)
-    given.out.mkdir(parents=True)
     for file in ("config.json", "agent.json"):
         shutil.copy(split_name(given.agent)[0] / file, given.out / file)
     print(save_checkpoint(given.out / "checkpoints", step=step, modules=agent.modules))

@@ -117,7 +117,7 @@ data convert interaction x --out y --stride 0
 data generate --out y --preset town --seed 1
 data generate --out y --count 1 --kinds random => (known: town, grid, ramp, street, and files of roads
 train bc --data x --out y --steps many
-train bc --data x --out y --steps 0
+train bc --data x --out y --batch 0 => batch must be positive, is 0
 evaluate --data x
 evaluate playback --data x --unknown 1
 plot curves --out a.png => give at least 1 RUN ...

@@ -118,8 +118,8 @@ def test_a_resumed_run_does_not_start_warm_again(trained: Trained, store: Path, 
 
 
 def test_a_warm_start_that_does_not_fit_leaves_no_run_behind(trained, store, tmp_path):
-    for source in (tmp_path / "nowhere", trained("bc_h")):
-        with pytest.raises((ConfigError, CheckpointError)):
+    for source, why in ((tmp_path / "nowhere", "no such folder"), (trained("bc_h"), r"another goals \(was True\)")):
+        with pytest.raises((ConfigError, CheckpointError), match=why):
             train(tiny("bc", store, tmp_path / "run", warm_start=source))
         # Else the corrected command would be refused: the folder holds a run already.
         assert not (tmp_path / "run" / "config.json").exists()

@@ -70,7 +70,7 @@ def choose(folder: Path, which: str = "") -> Path:
 
     found = {int(path.name[-12:]): path for path in checkpoints(folder / "checkpoints")}
     if not found:
-        raise ConfigError(f"{folder}: the run has no checkpoint yet")
+        raise ConfigError(f"{folder}: {'the run has no checkpoint yet' if folder.is_dir() else 'no such folder'}")
     last, held = max(found), f"it has those of the steps {', '.join(map(str, found))}"
     if named := re.fullmatch(r"(?:step-)?(\d+)", which):
         if int(named[1]) not in found:

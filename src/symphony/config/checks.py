@@ -38,7 +38,8 @@ class Settings:
     def __post_init__(self) -> None:
         kind: Any = type(self)
         for name, hint in type_hints(kind).items():
-            check(name.replace("_", "-"), getattr(self, name), hint)
+            named = (mark.name for mark in getattr(hint, "__metadata__", ()) if getattr(mark, "name", None))
+            check(next(named, name).replace("_", "-"), getattr(self, name), hint)
 
 
 def check(told: str, value: Any, hint: Any) -> None:

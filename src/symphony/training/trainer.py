@@ -462,7 +462,7 @@ def warm_start(agent: Agent, run: Path) -> None:
     try:
         load_checkpoint(source, modules=shared, partial=True, restore_rng=False)
     except CheckpointError as error:
-        changed = [] if agent.spec is None else _changed(before.agent, agent.spec.agent, "agent.")
-        if changed:
+        changed = [] if agent.spec is None else _changed(before, agent.spec)
+        if changed := [one for one in changed if one.startswith(("action", "goals", "agent", "discriminator"))]:
             error.message += f"; its agent has another {', '.join(changed)}"
         raise

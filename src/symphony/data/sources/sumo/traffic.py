@@ -23,7 +23,7 @@ _BODIES = (
     (0.07, (7.0, 9.5), (2.2, 2.45), (2.8, 3.6), "truck"),
     (0.03, (10.5, 12.0), (2.45, 2.55), (3.0, 3.4), "bus"),
 )
-_LONGEST_PARKED = 6.0  # metres
+_LONGEST_PARKED, _WIDEST_PASSING, _GAP = 6.0, 2.0, 0.6  # metres; the last is what SUMO's vehicles keep beside them
 _DRIVERS = ("IDM", "EIDM", "Krauss")
 TYPES = 24
 ROUTES = "traffic.rou.xml"
@@ -90,6 +90,8 @@ def write_demand(
     [3] of each vehicle k (its id in SUMO).
     """
     types, sizes, shares = _types(rng, sublane)
+    if parked:  # wider ones would stand behind a parked car for ever, as nobody uses the lane of oncoming traffic
+        shares = np.where(sizes[:, 1] < _WIDEST_PASSING, shares, 0.0) / shares[sizes[:, 1] < _WIDEST_PASSING].sum()
     following, length, lanes = network.edge_graph()
     speed = float(network.speed.max())
     chance: list[Doubles] = []
@@ -144,7 +146,7 @@ def _parked(network: Network, rng: np.random.Generator, sizes: Floats, first: in
         places = np.arange(12.0 + rng.uniform(0, 10), length[edge] - 15, 6.5)
         for at in places[rng.random(len(places)) < rng.uniform(-0.3, 0.8)]:
             kind = int(rng.choice(small))
-            aside = kerb + sizes[kind, 1] / 2 - rng.uniform(0.1, 0.8)
+            aside = kerb + sizes[kind, 1] / 2 - rng.uniform(0.1, min(0.8, 2 * kerb - _WIDEST_PASSING - _GAP))
             lines.append(
                 f'<vehicle id="{first + len(kinds)}" type="t{kind}" depart="0" departPos="stop" departLane="0">'
                 f'<route edges="{lane}"/><stop lane="{lane}_0" startPos="{at:.2f}" posLat="{-aside:.2f}" '
