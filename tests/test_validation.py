@@ -202,4 +202,4 @@ def test_names_of_checkpoints(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="not validated"):
         choose(plain, "best")
     with pytest.raises(ConfigError, match="no checkpoint yet"):
-        choose(tmp_path / "none")
+        choose(tmp_path)

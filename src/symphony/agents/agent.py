@@ -309,9 +309,9 @@ def usable_device(name: str) -> torch.device:
         device = torch.device(name)
     except RuntimeError as error:
         raise ConfigError(f"unknown device '{name}'") from error
-    if device.type == "cuda":
-        if (device.index or 0) >= torch.cuda.device_count():
-            raise ConfigError(f"device '{name}': this PyTorch sees no such CUDA device")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise ConfigError(f"device '{name}': this PyTorch sees no such CUDA device")
+    if device.type in ("cuda", "cpu"):
         return device
     try:
         # Not asked of CUDA, where each process would begin to use the first device.
