@@ -119,7 +119,7 @@ class EvaluateConfig(SimulationConfig):
     others: Others = "log"
     metric: Annotated[tuple[str, ...], Fixed, Suppress] = ()  # Import paths of metrics of your own.
     #: Run segments simulated at a time (changes memory, speed and rounding); 0: up to 64, or 16 with a planner, on
-    #: a card up to 1 024, fewer where their agents see many points.
+    #: a card up to 1 024, four times as many going back, fewer where their agents see many points.
     batch: Natural = 0
     #: Engine that runs the worker processes: `local`, or `ray`, on the cluster at RAY_ADDRESS or one started here.
     engine: Engine = "local"
