@@ -16,13 +16,11 @@ OBSERVATION, LOGITS, ACTION = ("agents", "observation"), ("agents", "logits"), (
 VALID, ROLLOUT = ("agents", "valid"), ("agents", "rollout")
 
 
-def categorical_actor(classes=7, observation=OBSERVATION, action=ACTION, kind=Categorical, mask=None):
-    """Logits are read beside a mask if there is one; they are those of any kind of categorical."""
+def categorical_actor(classes=7, observation=OBSERVATION, action=ACTION, kind=Categorical):
     torch.manual_seed(0)
     network = nn.Sequential(nn.Linear(4, 16), nn.ReLU(), nn.Linear(16, classes))
-    keys = {"logits": LOGITS} if mask is None else {"logits": LOGITS, "mask": mask}
     how = {"distribution_class": kind, "default_interaction_type": parts.InteractionType.RANDOM}
-    head = parts.ProbabilisticTensorDictModule(in_keys=keys, out_keys=[action], **how)
+    head = parts.ProbabilisticTensorDictModule(in_keys={"logits": LOGITS}, out_keys=[action], **how)
     body = parts.TensorDictModule(network, [observation], [LOGITS])
     return parts.ProbabilisticTensorDictSequential(body, head)
 
@@ -147,7 +145,7 @@ def _check_state(make, td, name):
 
 
 def _check_refusals(make, td):
-    wrong = {"reduction": ["median"], "label_smoothing": [1.0, -0.1], "gradient_penalty": [-1.0]}
+    wrong = {"reduction": ["median"], "gradient_penalty": [-1.0]}
     accepted = inspect.signature(type(make())).parameters
     for argument, values in wrong.items():
         for value in values if argument in accepted else ():

@@ -19,8 +19,9 @@ from helpers_store import brief, stored
 from symphony.bench import run as bench
 from symphony.bench.criticality import hardest
 from symphony.bench.measures import estimate, needed_groups
-from symphony.bench.run import run_suite
-from symphony.bench.suite import read_suite
+from symphony.bench.pages import sentence
+from symphony.bench.run import Verdict, run_suite
+from symphony.bench.suite import Threshold, read_suite
 from symphony.cli import main
 from symphony.errors import ConfigError, DataError
 from symphony.metrics.intervals import t_quantile
@@ -162,6 +163,7 @@ def test_as_many_groups_as_needed_and_no_more(limit: float, confidence: float) -
     ("at_most = 80", "at_most = true", 19, "at_most", "True"),
     ("at_most = 80", "at_most = 80\ncompared = true", 20, "compared", "no baseline"),
     ('planners = ["log"]', 'planners = ["logs"]', 25, "planners", "logs"),
+    ('planners = ["log"]', "planners = []", 25, "planners", "names none"),
     ("[[crowd]]", "[[crowds]]", 14, "", "unknown table"),
 ])  # fmt: skip
 def test_what_is_wrong_is_refused_before_anything_runs(suite, tmp_path, capsys, old, new, line, field, why):
@@ -212,6 +214,20 @@ def test_thresholds_that_are_lost_fail(suite: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "log" / "playback" / "view.html").exists()
 
 
+def test_a_baseline_is_not_compared_with_itself(suite: Path) -> None:
+    suite.write_text(SUITE.replace("[suite]", '[suite]\nbaseline = "log"') + "compared = true\n")
+    with pytest.raises(ConfigError, match=r"line 27, .*not compared with itself"):
+        read_suite(suite)
+
+
+def test_a_number_beside_its_limit_is_told_apart_from_it() -> None:
+    found = estimate([100.0, 0.0, 0.0], list("xyz"), 0.95, "rate")
+    limit = Threshold("at_fault_collision_rate", 33.3, "at_most", None, ("a",), ("b",))
+    assert sentence(Verdict(limit, "a", "b", "fails", found, found.mean)).endswith(
+        ": 33.3333, from 3 runs of 3 groups"
+    )
+
+
 def test_a_rate_compared_with_the_baselines_is_not_known_to_be_equal(suite: Path, tmp_path: Path) -> None:
     """Nothing happens to two that play back the log; that of 6 groups says little."""
     both = SUITE.partition("[[threshold]]")[0].replace("planners.py:fast", "log")
@@ -257,6 +273,10 @@ def test_a_suite_that_was_interrupted_goes_on_and_regressions_are_named(suite: P
     earlier = tmp_path / "out" / "result.json"
     earlier.write_text(earlier.read_text().replace(found.suite.store.checksum(), "0" * 64))
     with pytest.raises(DataError, match="other run segments"):
+        run_suite(read_suite(suite), tmp_path / "third")
+    earlier.write_text(earlier.read_text().replace("0" * 64, found.suite.store.checksum()))
+    suite.write_text(suite.read_text().replace("[[crowd]]", "[[crowd]]\nduration = 1", 1))
+    with pytest.raises(DataError, match="met other traffic then: duration differ"):
         run_suite(read_suite(suite), tmp_path / "third")
 
 

@@ -145,19 +145,6 @@ def test_acute_corners_have_the_side_that_the_distance_says(seed: int) -> None:
     assert torch.equal(torch.cat(alone, 1), flags[:, :300])
 
 
-def test_padding_batch_and_order_change_nothing(scenes: SceneBatch) -> None:
-    row, where = places(scenes, 6, seed=4)
-    together = Tables(scenes, FEW)
-    flat, _ = nearest_points(together, row, where)
-    distance = road_distance(scenes, row, where, together)
-    for b, lone in ((3, scene(SegmentStore(builtin_store("train"))[9])), (0, scene(straight_road()))):
-        mine = row == b
-        zero, alone = torch.zeros(int(mine.sum()), dtype=torch.int64), Tables(lone, FEW)
-        found, _ = nearest_points(alone, zero, where[mine].flip(1))
-        assert torch.equal(found.flip(1), flat[mine] - b * scenes.point.shape[1])
-        assert torch.equal(road_distance(lone, zero, where[mine].flip(1), alone).flip(1), distance[mine])
-
-
 def answers(scenes: SceneBatch, tables: Tables, at: tuple[torch.Tensor, torch.Tensor]) -> list[torch.Tensor]:
     flat, _ = nearest_points(tables, *at)
     return [flat, *(ask(scenes, *at, tables) for ask in (road_distance, offroad_flags))]
@@ -424,16 +411,3 @@ def test_who_stands_above_is_not_drawn_as_hit() -> None:
     (hits,) = contacts([world_of(saved, 0)], np.array([0, 2]))
     assert list(zip(hits.agent.tolist(), hits.other.tolist(), strict=True)) == [(0, 2), (2, 0)]
     assert draw_hit(new_figure(4, 4).add_subplot(), saved_clip(saved)) is None
-
-
-def test_a_device_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do on the CPU what is done where nothing may wait for the device."""
-    segments = overpass(), straight_road(3, steps=STEPS)
-    found = drive(*segments)[1]
-    for name in ("envs.flags", "envs.observation", "envs.driving", "geometry.nearest"):
-        monkeypatch.setattr(f"symphony.{name}.on_host", lambda _: False)
-    there = drive(*segments)[1]
-    for flag in (keys.COLLISION, keys.OFFROAD, ("agents", "observation", "objects_mask")):
-        assert torch.equal(found.get(flag), there.get(flag))
-    for name in ("road", "points", "objects"):
-        torch.testing.assert_close(*(each.get(("agents", "observation", name)) for each in (found, there)))

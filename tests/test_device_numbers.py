@@ -18,6 +18,7 @@ from symphony import keys
 from symphony.collectors import Systematic
 from symphony.envs import Displacement, DrivingEnv, ObservationConfig, collate, scene
 from symphony.roadgraph import LaneGraph
+from test_cells import overpass
 
 EVERYTHING = {"route": True, "along": True, "gaps": True, "clearance": True, "foresight": (0.5, 1.0)}
 GROUPS = {"points": (), "lights": (), "objects": ("gap", "gap_ahead", "along")}
@@ -55,7 +56,7 @@ def elements(seen: Any, group: str) -> Tensor:
 @pytest.mark.parametrize(("counts", "seed"), [((3, 60, 2), 0), ((3, 60, 2), 1), ((16, 4000, 30), 0)])
 @torch.no_grad()
 def test_a_device_sees_and_flags_the_same(counts, seed, monkeypatch):
-    segments = [crossing(6, seed=seed), straight_road(5, seed=seed), ring()]
+    segments = [crossing(6, seed=seed), straight_road(5, seed=seed), ring(), overpass()]
     scenes = collate([scene(s, [0, 1], LaneGraph(s.road)) for s in segments])
     env = DrivingEnv(scenes, observation=ObservationConfig(*counts, **EVERYTHING))
     given = states(env, seed)

@@ -53,9 +53,9 @@ def sentence(one: Verdict) -> str:
         return f"{one.threshold}: not defined in any run"
     bound = ", without a bound" if one.bound is None else ""
     if one.bound is not None and one.threshold.confidence is not None:
-        bound = f", {one.threshold.side.replace('_', ' ')} {one.bound:.3g}"
+        bound = f", {one.threshold.side.replace('_', ' ')} {one.bound:.6g}"
         bound += f" with {100 * one.threshold.confidence:g} % confidence"
-    return f"{one.threshold}: {one.found.mean:.3g}{bound}, from {one.found.runs} runs of {one.found.groups} groups"
+    return f"{one.threshold}: {one.found.mean:.6g}{bound}, from {one.found.runs} runs of {one.found.groups} groups"
 
 
 def _what(run: dict[str, Any]) -> str:

@@ -14,7 +14,7 @@ from symphony.bench.measures import MEASURES, Estimate, Kind, Run, estimate, mea
 from symphony.bench.published import pdm
 from symphony.bench.suite import Crowd, Suite, SuitePlanner, Threshold
 from symphony.errors import AllFailedError, DataError
-from symphony.evaluation.planners import run_score
+from symphony.evaluation.planners import Record, crowd_differences, run_score
 from symphony.evaluation.report import Report, report
 from symphony.files import Lock, write_file, write_json
 from symphony.render.viewer import view_page
@@ -66,6 +66,7 @@ class Pair:
     planned: int
     folder: Path
     report: Report = field(default_factory=lambda: Report("", "ego"))
+    traffic: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
 
     @property
@@ -113,6 +114,7 @@ class Result:
                 **{"planner": one.planner.name, "crowd": one.crowd.name, "planned": one.planned},
                 **{"stopped": one.stopped, "seconds": round(one.seconds, 1)},
                 "numbers": {name: measured(one.runs, measure).mean for name, measure in MEASURES.items()},
+                **one.traffic,
                 "per_run": [{**run, "score": run_score(run)} for run in one.runs],
             }
 
@@ -138,19 +140,19 @@ def run_suite(suite: Suite, out: Path, progress: Progress = None, *, view: bool 
     """
     began = time.perf_counter()
     with Lock(out / "suite.lock"):
-        base = _earlier(suite)
-        pairs = []
+        earlier, pairs = _earlier(suite), []
         # The baseline comes first: others are compared with it.
         for planner in sorted(suite.planners, key=lambda one: one.name != suite.baseline):
             for crowd in suite.crowds:
                 planned = len(suite.items) * crowd.config.rollouts
                 pairs.append(Pair(planner, crowd, planned, out / planner.name / crowd.name))
-                _drive(suite, pairs[-1], progress)
+                _drive(suite, pairs[-1], earlier.get((planner.name, crowd.name), {}), progress)
         order = [one.name for one in suite.planners]
         pairs.sort(key=lambda pair: (suite.crowds.index(pair.crowd), order.index(pair.planner.name)))
         runs = [run for pair in pairs for run in pair.runs]
         if all(run["failed"] for run in runs):
             raise AllFailedError(f"every run failed, the first: {runs[0]['failed']}")
+        base = {names: one["per_run"] for names, one in earlier.items()}
         for pair in pairs:
             if pair.planner.name == suite.baseline:
                 base |= {(one, pair.crowd.name): pair.runs for one in order if one != suite.baseline}
@@ -168,8 +170,10 @@ def run_suite(suite: Suite, out: Path, progress: Progress = None, *, view: bool 
     return result
 
 
-def _drive(suite: Suite, pair: Pair, progress: Progress) -> None:
-    """Simulate a pair part by part, until its verdict is clear."""
+def _drive(suite: Suite, pair: Pair, before: Record, progress: Progress) -> None:
+    """Simulate a pair part by part, until its verdict is clear. A :class:`DataError` says what differs if it did not
+    meet the traffic that it met ``before``.
+    """
     began, config = time.perf_counter(), pair.crowd.config
     agent = load_agent(pair.crowd.agent, config.device)
     # Beside log playback no other agent is simulated.
@@ -192,7 +196,14 @@ def _drive(suite: Suite, pair: Pair, progress: Progress) -> None:
             planner_seconds=pair.planner.seconds,
             progress=tell,
         ).only(suite.store.ids[i] for i in items)
-        found = report(folder, "ego")
+        about, found = folder.about, report(folder, "ego")
+        pair.traffic = {"driver": about.drivers["interactive"], "settings": dict(about.settings)}
+        if "settings" in before:  # which earlier versions did not write
+            now = before | pair.traffic
+            both = ({**one, "crowd": one["driver"], "store": dict(about.store)} for one in (now, before))
+            if differing := crowd_differences(*both):
+                what = f"{pair.name} met other traffic then: {', '.join(differing)} differ"
+                raise DataError(what, file=Path(suite.baseline), field="pairs")
         pair.report.rows += with_pdm(found, folder)
         pair.report.events |= found.events
         pair.report.collision_in |= found.collision_in
@@ -278,8 +289,8 @@ def find_regressions(pair: Pair, base: Sequence[Run]) -> list[dict[str, Any]]:
     return found
 
 
-def _earlier(suite: Suite) -> dict[tuple[str, str], list[Run]]:
-    """Return the runs of an earlier result that is the baseline, by planner and crowd."""
+def _earlier(suite: Suite) -> dict[tuple[str, str], Record]:
+    """Return the pairs of an earlier result that is the baseline, by planner and crowd."""
     if not isinstance(suite.baseline, Path):
         return {}
     try:
@@ -288,6 +299,6 @@ def _earlier(suite: Suite) -> dict[tuple[str, str], list[Run]]:
             raise DataError(f"has format {found['format']}, not {FORMAT}", file=suite.baseline)
         if found["store"]["checksum"] != suite.store.checksum():
             raise DataError("is of other run segments", file=suite.baseline, field="store")
-        return {(one["planner"], one["crowd"]): list(one["per_run"]) for one in found["pairs"]}
+        return {(one["planner"], one["crowd"]): one for one in found["pairs"] if list(one["per_run"])}
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"is not the result of a suite: {error!r}", file=suite.baseline) from error

@@ -159,7 +159,7 @@ def read_suite(path: Path, **shared: Any) -> Suite:
         if not baseline.is_file():
             raise top.wrong("baseline", "is neither a planner of the suite nor a file")
     groups = len({str(store.groups[i]) for i in items})
-    limits = tuple(_threshold(one, names, sure, groups, bool(baseline)) for one in tables["threshold"])
+    limits = tuple(_threshold(one, names, sure, groups, baseline) for one in tables["threshold"])
     name = top.given.get("name", path.stem)
     return Suite(name, path, store, items, planners, crowds, limits, baseline)
 
@@ -270,7 +270,9 @@ def _crowd(table: _Table, shared: dict[str, Any]) -> Crowd:
     return Crowd(table.named(), agent, config)
 
 
-def _threshold(table: _Table, names: dict[str, list[str]], sure: float, groups: int, compares: bool) -> Threshold:
+def _threshold(
+    table: _Table, names: dict[str, list[str]], sure: float, groups: int, baseline: str | Path
+) -> Threshold:
     """Read a threshold, and check that a planner could keep it with so few or many groups of segments."""
     given, confidence = table.given, table.given.get("confidence", sure)
     if given["metric"] not in MEASURES:
@@ -281,12 +283,16 @@ def _threshold(table: _Table, names: dict[str, list[str]], sure: float, groups: 
     if not math.isfinite(given[side]):
         raise table.wrong(side, f"is a number, not {given[side]}")
     for key, known in names.items():
+        if given.get(key) == []:
+            raise table.wrong(key, "names none; leave it out for all")
         for name in given.get(key, ()):
             if name not in known:
                 raise table.wrong(key, f"there is no {name!r} among {known}")
     compared = given.get("compared", False)
-    if compared and not compares:
+    if compared and not baseline:
         raise table.wrong("compared", "the suite has no baseline")
+    if compared and {str(baseline)} == {*given.get("planners", names["planners"])}:
+        raise table.wrong("compared", f"{baseline} is the baseline, and not compared with itself")
     if confidence is not False:
         table.check_confidence(confidence)
         needed = 2

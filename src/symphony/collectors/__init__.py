@@ -24,22 +24,7 @@ from symphony.collectors.rules import (
 )
 
 __all__ = [
-    "Aggregate",
-    "Backtrack",
-    "BeamSearchCollector",
-    "BeamSearchPlanner",
-    "BeamSearchResult",
-    "KeepAll",
-    "KeepBest",
-    "KeyScore",
-    "PruningRule",
-    "ReplaceBad",
-    "Systematic",
-    "beam_search",
-    "branch",
-    "check_branching",
-    "lineage",
-    "max_then_sum",
-    "mean_then_sum",
-    "with_rows",
-]
+    "Aggregate", "Backtrack", "BeamSearchCollector", "BeamSearchPlanner", "BeamSearchResult", "KeepAll", "KeepBest",
+    "KeyScore", "PruningRule", "ReplaceBad", "Systematic", "beam_search", "branch", "check_branching", "lineage",
+    "max_then_sum", "mean_then_sum", "with_rows",
+]  # fmt: skip

@@ -451,7 +451,8 @@ def merge(paths: Sequence[Path], out: Path, progress: Told | None = None) -> Seg
         raise DataError(f"an unfinished conversion to that name lies in {folder_of(out)}", file=out)
     draft = out.with_name(f"{out.name}.merging")
     if (draft / store_format.REPORT).is_file():  # which a merge writes last
-        raise DataError("is a store, in the way of what is merged; move it", file=draft)
+        what = "is a store, in the way of what is merged; move it"
+        raise DataError(f"{what}, or rename it to {out.name} if a merge was killed", file=draft)
     if (draft / store_format.HEADER).is_file():  # of a merge that was killed, or goes on, which is told
         with store_format.lock(draft):
             for part in sorted(draft.iterdir(), key=lambda part: part.name == store_format.HEADER):

@@ -124,18 +124,22 @@ def check_crowds(records: Sequence[Record]) -> None:
     first: dict[str, Record] = {}
     for one in records:
         other = first.setdefault(crowd_name(one), one)
-        here, there = (_LATER | record["settings"] for record in (one, other))  # suites do not save them
-        beside_log = one["crowd"] == other["crowd"] == PLAYBACK
-        names = _BESIDE_LOG if beside_log else [name for name in there | here if name not in _FREE]
-        differing = [name for name in names if here.get(name) != there.get(name)]
-        # The same agent may go by several names.
-        same_weights = here.get("weights") is not None and here.get("weights") == there.get("weights")
-        differing += ["the agent"] if one["crowd"] != other["crowd"] and not same_weights else []
-        differing += ["the store"] if one["store"]["checksum"] != other["store"]["checksum"] else []
-        differing += [] if _scores(one).keys() & _scores(other).keys() else ["all segments"]
-        if differing:
+        if differing := crowd_differences(one, other):
             both = f"{planner_title(other)} and {planner_title(one)} did not meet the same crowd"
             raise ConfigError(f"{both}: {', '.join(differing)} differ; compare them separately")
+
+
+def crowd_differences(one: Record, other: Record) -> list[str]:
+    """Return what differs between the traffic of two records: settings, the agent, the store, all segments."""
+    here, there = (_LATER | record["settings"] for record in (one, other))  # suites do not save them
+    beside_log = one["crowd"] == other["crowd"] == PLAYBACK
+    names = _BESIDE_LOG if beside_log else [name for name in there | here if name not in _FREE]
+    differing = [name for name in names if here.get(name) != there.get(name)]
+    # The same agent may go by several names.
+    same_weights = here.get("weights") is not None and here.get("weights") == there.get("weights")
+    differing += ["the agent"] if one["crowd"] != other["crowd"] and not same_weights else []
+    differing += ["the store"] if one["store"]["checksum"] != other["store"]["checksum"] else []
+    return differing + ([] if _scores(one).keys() & _scores(other).keys() else ["all segments"])
 
 
 def _scores(record: Record) -> dict[str, float | None]:

@@ -131,15 +131,13 @@ class Fit(NamedTuple):
     """The fit of an actor to the actions of a batch. All `[...]`.
 
     Attributes:
-        cost: negative log-likelihood after label smoothing.
-        nll: negative log-likelihood, detached.
+        cost: negative log-likelihood.
         counted: bool, entries that count.
         entropy: entropy of the actor, detached; None unless it is categorical.
         hit: 1.0 where the actor's mode is the action; None unless it is categorical.
     """
 
     cost: Float[Tensor, "*b"]
-    nll: Float[Tensor, "*b"]
     counted: Bool[Tensor, "*b"]
     entropy: Float[Tensor, "*b"] | None
     hit: Float[Tensor, "*b"] | None
@@ -151,7 +149,6 @@ class ActorLoss(MaskedLoss):
     Args:
         actor_network: probabilistic module with a `get_dist`.
         reduction: see :class:`MaskedLoss`.
-        label_smoothing: share of the target spread evenly over all categories, in [0, 1); categorical actors only.
         use_mask: see :class:`MaskedLoss`.
     """
 
@@ -165,19 +162,13 @@ class ActorLoss(MaskedLoss):
         actor_network: ProbabilisticTensorDictSequential | ProbabilisticTensorDictModule,
         *,
         reduction: Reduction | None = None,
-        label_smoothing: float = 0.0,
         use_mask: bool | None = None,
     ) -> None:
         super().__init__(reduction, use_mask)
-        if not 0.0 <= label_smoothing < 1.0:
-            raise ValueError(f"label_smoothing must be in [0, 1), is {label_smoothing}")
         self.convert_to_functional(actor_network, "actor_network")
         heads = [m for m in actor_network.modules() if isinstance(m, ProbabilisticTensorDictModule)]
         kind = heads[-1].distribution_class if heads else None
         self.categorical = isinstance(kind, type) and issubclass(kind, Categorical)  # or one-hot, as TorchRL's
-        if label_smoothing and not self.categorical:
-            raise ValueError("label_smoothing needs an actor whose distribution is a torch Categorical")
-        self.label_smoothing = label_smoothing
         self.out_keys = [*self.losses, *(["entropy", "accuracy"] if self.categorical else [])]
 
     def _read_keys(self) -> list[NestedKey]:
@@ -203,16 +194,11 @@ class ActorLoss(MaskedLoss):
         action = torch.where(fitted, action, torch.zeros_like(action))
         cost = -dist.log_prob(action)
         if not isinstance(dist, Categorical):
-            return Fit(cost, cost.detach(), counted, None, None)
-        nll = cost.detach()
-        if self.label_smoothing:
-            possible = dist.logits > -torch.inf  # over all these a share of the target is spread evenly
-            even = -torch.where(possible, dist.logits, 0.0).sum(-1) / possible.sum(-1)
-            cost = (1.0 - self.label_smoothing) * cost + self.label_smoothing * even
+            return Fit(cost, counted, None, None)
         with torch.no_grad():
             index = action.argmax(-1) if one_hot else action
             hit = (dist.logits.argmax(-1) == index).to(dist.logits.dtype)
-            return Fit(cost, nll, counted, dist.entropy(), hit)
+            return Fit(cost, counted, dist.entropy(), hit)
 
     def _statistics(self, fit: Fit, counted: Bool[Tensor, "*b"]) -> dict[str, Float[Tensor, "*_"]]:
         """Return entropy and accuracy over some entries, of a categorical actor."""
@@ -233,7 +219,6 @@ class BCLoss(ActorLoss):
         actor_network: probabilistic module with a `get_dist`.
         reduction: `"mean"` over the valid entries (0 if there are none), `"sum"`, or `"none"`, which keeps the
             shape `[...]` of the log-probability, with zeros at invalid entries.
-        label_smoothing: share of the target spread evenly over all categories, in [0, 1); categorical actors only.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_bc`, and for categorical actors, detached, `entropy` of the actor and `accuracy` of its mode
@@ -241,7 +226,7 @@ class BCLoss(ActorLoss):
 
     Raises:
         KeyError: at the call, if the action or the mask is missing.
-        ValueError: for a bad `label_smoothing` or `reduction`, or an action or a mask of another shape.
+        ValueError: for a bad `reduction`, or an action or a mask of another shape.
     """
 
     @dataclass
@@ -280,10 +265,9 @@ class DistillationLoss(ActorLoss):
         actor_network: probabilistic module with a `get_dist`, over discrete or continuous actions.
         reduction: `"mean"` as above (0 for a kind that is absent), `"sum"`, or `"none"`, which keeps the shape
             `[...]` of the log-probability, zeros where an entry does not count.
-        label_smoothing: share of the target spread evenly over all categories, in [0, 1); categorical actors only.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
-    Writes `loss_distillation` and, detached, `nll_expert` and `nll_rollout` (unweighted, without label smoothing);
+    Writes `loss_distillation` and, detached, `nll_expert` and `nll_rollout` (unweighted);
     for categorical actors also `entropy` and `accuracy` on the expert entries, as :class:`BCLoss` does. They are
     means over the entries that count, 0 without one; without reduction they are per entry like the loss.
 
@@ -326,7 +310,7 @@ class DistillationLoss(ActorLoss):
         if tensordict.get(self.tensor_keys.weight, None) is not None:
             cost = cost * self._entries(tensordict, self.tensor_keys.weight, "weight", shape).where(rollout, 1.0)
         reduction: Reduction = "none" if self.reduction == "none" else "mean"
-        nll = [self._reduced(fit.nll, kind, reduction) for kind in (expert, rollout)]
+        nll = [self._reduced(fit.cost.detach(), kind, reduction) for kind in (expert, rollout)]
         loss = self._reduced(fit.cost, expert) + self._reduced(cost, rollout)
         found = {"loss_distillation": loss, "nll_expert": nll[0], "nll_rollout": nll[1]}
         result = TensorDict(found | self._statistics(fit, expert))

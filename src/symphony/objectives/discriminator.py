@@ -29,7 +29,6 @@ class DiscriminatorLoss(MaskedLoss):
         gradient_penalty: weight of the mean squared norm, over data, of the logit's gradient with respect to an
             entry's own floating-point inputs `[..., N, *]`, added to the loss (R1 of Mescheder et al. 2018; their
             gamma is twice this weight). It supposes that a logit depends on its own entry's inputs only.
-        label_smoothing: share of the target spread evenly over both kinds, in [0, 1).
         reduction: `"mean"` as above (0 for a kind that is absent); `"sum"` over all entries that count; `"none"`,
             which keeps the shape `[..., N]`, with zeros elsewhere. The penalty is reduced and added alike.
         use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
@@ -70,18 +69,14 @@ class DiscriminatorLoss(MaskedLoss):
         discriminator: TensorDictModuleBase,
         *,
         gradient_penalty: float = 0.0,
-        label_smoothing: float = 0.0,
         reduction: Reduction | None = None,
         use_mask: bool | None = None,
     ) -> None:
         super().__init__(reduction, use_mask)
         if not (math.isfinite(gradient_penalty) and gradient_penalty >= 0.0):
             raise ValueError(f"gradient_penalty must be at least 0, is {gradient_penalty}")
-        if not 0.0 <= label_smoothing < 1.0:
-            raise ValueError(f"label_smoothing must be in [0, 1), is {label_smoothing}")
         self.convert_to_functional(discriminator, "discriminator")
         self.gradient_penalty = gradient_penalty
-        self.label_smoothing = label_smoothing
         self.out_keys = [
             "loss_discriminator",
             "accuracy_simulated",
@@ -132,8 +127,7 @@ class DiscriminatorLoss(MaskedLoss):
     def _cross_entropy(
         self, logit: Float[Tensor, "*b"], fake: Bool[Tensor, "*b"], real: Bool[Tensor, "*b"]
     ) -> Float[Tensor, ""] | Float[Tensor, "*b"]:
-        target = fake.to(logit.dtype) * (1.0 - self.label_smoothing) + 0.5 * self.label_smoothing
-        entropy = functional.binary_cross_entropy_with_logits(logit, target, reduction="none")
+        entropy = functional.binary_cross_entropy_with_logits(logit, fake.to(logit.dtype), reduction="none")
         if self.reduction != "mean":
             return self._reduced(entropy, fake | real)
         return 0.5 * (self._reduced(entropy, fake) + self._reduced(entropy, real))

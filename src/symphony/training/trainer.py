@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -42,6 +42,7 @@ from symphony.training.processes import Processes
 
 if TYPE_CHECKING:
     from symphony.learning import SceneDataset, SearchReplay
+    from symphony.training.hooks import Previewer, Validator
 
 KEEP = 3  # checkpoints in a run's folder, the last ones; the best beside them
 CLIP = 1.0  # largest norm of a network's gradient
@@ -144,20 +145,6 @@ class Alarms:
         return "discriminator_blind" if max(self._recent) < 0.52 else None
 
 
-class Validation(Protocol):
-    """A hook that evaluates the agent after an update and returns numbers for the record."""
-
-    best: Best | None
-    what: str  # the run segments of `dataset` and how often they are simulated: scores of others can't be compared
-    dataset: SceneDataset
-
-    def __call__(self, step: int, progress: Callable[[int, int], None] | None = None) -> dict[str, float]: ...  # noqa: D102
-
-
-Preview = Callable[[int, Tracker], dict[str, float]]
-"""A hook that shows the agent as it is after an update, also to the tracker; returns numbers for the record."""
-
-
 class Trainer:
     """Runs the updates of a recipe: records, validation, previews and checkpoints, in that order.
 
@@ -179,8 +166,8 @@ class Trainer:
         previewer: a hook called every ``preview.every`` updates; see :func:`symphony.training.hooks.add_hooks`.
     """
 
-    validator: Validation | None = None
-    previewer: Preview | None = None
+    validator: Validator | None = None
+    previewer: Previewer | None = None
 
     def __init__(
         self,
