@@ -299,6 +299,25 @@ def test_cars_at_the_kerb_stand_partly_on_lanes_and_others_pass_them(simulated: 
     assert (counts > [40, 3, 12]).all()
 
 
+@needs_sumo
+def test_who_is_told_to_drive_or_stand_in_a_street_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = list[NDArray[np.bool_]]()
+    monkeypatch.setattr(sumo, "cut_segments", lambda _, __, traffic, *___: seen.append(traffic.present) or ([], {}))
+    sumo.generate_run("street", 1, 45.0)
+    assert len(seen[0]) > 50
+    assert seen[0].any(1).all()
+
+
+@needs_sumo
+@pytest.mark.parametrize("seed", [5, 7])
+def test_on_a_freeway_nobody_appears_or_ends_inside_the_map(seed: int) -> None:
+    """The ends of the other carriageway and of its ramps are outside, too."""
+    for s in sumo.generate_run("ramp", seed, 45.0)[0]:
+        inside = np.linalg.norm(s.position[..., :2], axis=-1) < 170
+        ends = np.diff(s.valid, axis=1)
+        assert not (ends & np.where(s.valid[:, 1:], inside[:, 1:], inside[:, :-1])).any(), s.segment_id
+
+
 def test_segments_conform_and_keep_the_exclusions(driven: list[RunSegment]) -> None:
     """Schema, speeds, headings, lanes and the side of the boundary, and that vehicles are on the road."""
     report = check_segments(driven)

@@ -295,19 +295,22 @@ def freeway(rng: Random, folder: Path, longer: float = 0.0) -> Path:
     direction = rng.uniform(0, 2 * np.pi)
     # A longer road turns as much, not more.
     curvature = rng.uniform(-1, 1) / 1500 * (600 / (600 + longer))
+    between = rng.uniform((180, 120, 130), (260, 200, 180), (2, 3))
+    between[rng.random(2) < 0.4, 1:] = 0  # joined by a weaving lane
+    # Both sides are as long, so that neither ends beside a ramp of the other.
+    outer = 300 + longer + (between.sum(1).max() - between.sum(1)) / 2
+    stations = np.cumsum([np.zeros(2), outer, *between.T, outer], axis=0)
     for side in range(2):
         road, bend = (int(rng.integers(2, 4)), speed, width), curvature * (1 - 2 * side)
-        _carriageway(net, rng, f"c{side}", road, (direction + side * np.pi, bend, longer))
+        _carriageway(net, rng, f"c{side}", road, (direction + side * np.pi, bend), stations[:, side])
     return net.compile(folder, "--default.junctions.radius 4 --junctions.scurve-stretch 1.5")
 
 
-def _carriageway(net: PlainNetwork, rng: Random, name: str, road: Road, course: tuple[float, ...]) -> None:
+def _carriageway(
+    net: PlainNetwork, rng: Random, name: str, road: Road, course: tuple[float, float], stations: Doubles
+) -> None:
     """Add one direction of a freeway: base, stretch beside the on-ramp, gap, stretch beside the off-ramp, end."""
-    (lanes, speed, width), (direction, curvature, longer) = road, course
-    weaving = rng.random() < 0.4
-    outer = 300 + longer
-    between = [rng.uniform(180, 260), *(0 if weaving else rng.uniform(*each) for each in ((120, 200), (130, 180)))]
-    stations = np.cumsum([0, outer, *between, outer])
+    (lanes, speed, width), (direction, curvature), weaving = road, course, stations[2] == stations[3]
     shift, median, spin = stations[-1] / 2, 5.0, _rotation(direction)
 
     def along(s: Doubles, right: float | Doubles) -> Doubles:
@@ -333,7 +336,7 @@ def _carriageway(net: PlainNetwork, rng: Random, name: str, road: Road, course: 
     on, off = 1, len(extra) - 1
     # Ramps are longer than a crop's radius, so that their ends are never on a map.
     reach = np.linspace(1.7, 0, 20)
-    far = 150 + longer
+    far = stations[1] - 150
     gap = (3 * reach + 30 * reach**2) * (far / 150)
     start = along(marks[on] - far * reach, edge + gap)
     end = along(marks[off] + far * reach[::-1], edge + gap[::-1])

@@ -23,7 +23,8 @@ _BODIES = (
     (0.07, (7.0, 9.5), (2.2, 2.45), (2.8, 3.6), "truck"),
     (0.03, (10.5, 12.0), (2.45, 2.55), (3.0, 3.4), "bus"),
 )
-_LONGEST_PARKED, _WIDEST_PASSING, _GAP = 6.0, 2.0, 0.6  # metres; the last is what SUMO's vehicles keep beside them
+_LONGEST_PARKED, _WIDEST_PASSING = 6.0, 2.0  # metres
+_GAP, _AHEAD = 0.6, 3.2  # metres that vehicles keep beside them and, at most, ahead; SUMO puts nobody nearer
 _DRIVERS = ("IDM", "EIDM", "Krauss")
 TYPES = 24
 ROUTES = "traffic.rou.xml"
@@ -63,7 +64,7 @@ def _types(rng: np.random.Generator, sublane: bool) -> tuple[list[str], Floats, 
             f'<vType id="t{k}" vClass="{name}" length="{size[0]:.2f}" width="{size[1]:.2f}" '
             f'height="{size[2]:.2f}" carFollowModel="{rng.choice(_DRIVERS)}" sigma="{rng.uniform(0.1, 0.5):.2f}" '
             f'speedFactor="normc(0.98,0.08,0.6,1.3)" tau="{tau:.2f}" accel="{heavy * rng.uniform(1.6, 2.9):.2f}" '
-            f'decel="{rng.uniform(2.8, 4.2):.2f}" minGap="{rng.uniform(1.6, 3.2):.2f}"{extra}/>'
+            f'decel="{rng.uniform(2.8, 4.2):.2f}" minGap="{rng.uniform(1.6, _AHEAD):.2f}"{extra}/>'
         )
         sizes.append(np.round(size, 2))
         shares.append(share / counts[body])
@@ -143,7 +144,7 @@ def _parked(network: Network, rng: np.random.Generator, sizes: Floats, first: in
     for edge in np.flatnonzero(length):
         # Of the lanes of an edge the first is at the kerb, which in networks of our own is on the right.
         kerb, lane = network.width[np.argmax(network.edge == edge)] / 2, network.edge_names[edge]
-        places = np.arange(12.0 + rng.uniform(0, 10), length[edge] - 15, 6.5)
+        places = np.arange(12.0 + rng.uniform(0, 10), length[edge] - 15, _LONGEST_PARKED + _AHEAD)
         for at in places[rng.random(len(places)) < rng.uniform(-0.3, 0.8)]:
             kind = int(rng.choice(small))
             aside = kerb + sizes[kind, 1] / 2 - rng.uniform(0.1, min(0.8, 2 * kerb - _WIDEST_PASSING - _GAP))
@@ -195,7 +196,8 @@ def simulate_traffic(
         f"--duration-log.disable true --device.fcd.begin {warm_up:.1f} --fcd-output tracks.csv "
         "--fcd-output.attributes x,y,angle --fcd-output.skip-empty true "
     )
-    arguments += "--lateral-resolution 0.5" if sublane else "--lanechange.duration 3"
+    # Who finds no room must not keep all others out who start on that edge.
+    arguments += "--lateral-resolution 0.5 --eager-insert true" if sublane else "--lanechange.duration 3"
     run_program("sumo", arguments, folder)
     time = warm_up + STEP * np.arange(round((duration - warm_up) / STEP), dtype=np.float64)
     front, angle = _read_tracks(folder / "tracks.csv", time, len(size))
