@@ -88,10 +88,12 @@ def test_rates_of_independent_runs_are_binomial(hits: list[bool], confidence: fl
         assert (found.low, found.high) == pytest.approx((100 * low, 100 * high))
 
 
+@pytest.mark.parametrize("kind", ["rate", "share"])
 @pytest.mark.parametrize(("rate", "alike", "sizes"), [
     (0.05, 0.6, [5] * 20), (0.2, 0.0, [5] * 20), (0.5, 0.9, [5] * 20), (0.3, 1.0, [40] * 5 + [1] * 25),
+    (0.05, 0.0, [1] * 60), (0.01, 0.0, [1] * 200),
 ])  # fmt: skip
-def test_bounds_of_rates_hold_as_often_as_they_say(rate: float, alike: float, sizes: list[int]) -> None:
+def test_bounds_of_rates_hold_as_often_as_they_say(rate: float, alike: float, sizes: list[int], kind: str) -> None:
     """Also where the runs of a group share their fate; as runs of their own they would not."""
     rng = np.random.default_rng(0)
     groups = np.repeat(np.arange(len(sizes)), sizes)
@@ -99,7 +101,7 @@ def test_bounds_of_rates_hold_as_often_as_they_say(rate: float, alike: float, si
     for _ in range(50):
         shared, own = rng.random(len(sizes))[groups] < rate, rng.random(len(groups)) < rate
         hit = np.where(rng.random(len(sizes))[groups] < alike, shared, own)
-        held += estimate((100.0 * hit).tolist(), groups.astype(str).tolist(), 0.95, "rate").high >= 100 * rate
+        held += estimate((100.0 * hit).tolist(), groups.astype(str).tolist(), 0.95, kind).high >= 100 * rate
     assert held / 50 >= 0.93
 
 
@@ -120,10 +122,23 @@ def test_means_have_students_bounds(count: int, confidence: float) -> None:
 def test_of_planners_that_did_nothing_wrong_no_difference_is_known_to_be_none(count: int, confidence: float) -> None:
     names = [str(k) for k in range(count)]
     rate = estimate([0.0] * count, names, confidence, "rate")
-    for kind in ("difference of rates", "share"):
-        found = estimate([0.0] * count, names, confidence, kind)
-        assert found.high == -found.low == pytest.approx(rate.high)
+    found = estimate([0.0] * count, names, confidence, "difference")
+    assert found.high == -found.low == pytest.approx(rate.high)
     assert estimate([0.1] * count, names, confidence).high is None
+
+
+@given(st.lists(st.floats(0, 100), min_size=1, max_size=5), st.integers(2, 60), st.sampled_from([0.8, 0.95]))
+def test_a_worse_run_shows_no_better_score(worse: list[float], count: int, confidence: float) -> None:
+    """Also where it is the only one that differs: few runs may be far from all others."""
+    names = [str(k) for k in range(count + len(worse))]
+    found, best = (
+        estimate([*some, *[100.0] * count], names, confidence, "share") for some in (worse, [100.0] * len(worse))
+    )
+    assert found.low <= best.low + 1e-9
+    assert (best.low, best.high) == (
+        pytest.approx(100 - estimate([0.0] * len(names), names, confidence, "rate").high),
+        100,
+    )
 
 
 @given(st.floats(0.1, 60), st.sampled_from([0.8, 0.95, 0.99]))
@@ -286,7 +301,7 @@ def test_examples_end_as_they_say(tmp_path: Path, name: str, status: int, monkey
     brief(tmp_path / "brief", range(5), 16)
     text = (EXAMPLES / name).read_text().replace("rollouts = 2", "rollouts = 1")
     text = text.replace('data = "builtin:test"', 'data = "brief"')
-    text = text.replace("at_least = 50", "at_least = 10")  # so few runs tell little
+    text = text.replace("at_least = 50", "at_least = 50\nconfidence = false")  # so few runs tell little
     (tmp_path / name).write_text(re.sub(r"at_most = [1-9]\d", "at_most = 90", text))
     (tmp_path / "coast.py").write_bytes((EXAMPLES / "coast.py").read_bytes())
     assert main(["test", str(tmp_path / name), "--out", str(tmp_path / "out"), "--no-view"]) == status

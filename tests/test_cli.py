@@ -96,6 +96,7 @@ def test_installed_command_prints_whatever_the_terminal_can_show(store: Path) ->
     how: Any = {"capture_output": True, "text": True, "env": {**os.environ, "PYTHONIOENCODING": "ascii"}}
     assert subprocess.run([command, "--version"], check=True, **how).stdout == f"symphony {__version__}\n"
     assert r"\u2013" in subprocess.run([command, "data", "info", str(store)], check=True, **how).stdout
+    assert subprocess.run(f"{command} --version >&- 2>&-", shell=True, check=True)  # noqa: S602 - our own words
 
 
 WRONG = """

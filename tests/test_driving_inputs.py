@@ -12,7 +12,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
 
 from helpers_runs import tiny, weights
 from helpers_segments import crossing, straight_road
@@ -26,7 +25,6 @@ from symphony.envs.objects import Observers
 from symphony.envs.observation import OBJECT_FEATURES, SELF_FEATURES, ObservationConfig, observed_lights
 from symphony.envs.routes import ALONG_FEATURES, POINTS, ROUTE_FEATURES, SPACING, RouteWindow, along_route
 from symphony.envs.scene import LIGHT_COLUMN, Tables, collate
-from symphony.geometry.frames import rotate
 from symphony.learning import SceneDataset
 from symphony.recipes import train
 
@@ -46,26 +44,6 @@ def scene(seed: int, others: int = 6) -> tuple[Any, ...]:
     route = RouteWindow(points, torch.ones(1, 1, POINTS, dtype=torch.bool), torch.tensor([[8]]))
     state = torch.cat([place, motion], -1)
     return own[None, None], size[None, None], state[None, None], size.expand(1, 1, others, 2), route
-
-
-def moved(parts: tuple[Any, ...], angle: float, shift: Tensor) -> tuple[Any, ...]:
-    own, size, others, sizes, route = parts
-    turned = torch.tensor(angle, dtype=torch.float64)
-
-    def agents(state: Tensor) -> Tensor:
-        place = rotate(state[..., :2], turned.expand(state.shape[:-1])) + shift
-        velocity = rotate(state[..., 3:], turned.expand(state.shape[:-1]))
-        return torch.cat([place, state[..., 2:3] + turned, velocity], -1)
-
-    line = rotate(route.points, turned.expand(route.points.shape[:-1])) + shift
-    return agents(own), size, agents(others), sizes, route._replace(points=line)
-
-
-@given(seed=st.integers(0, 10_000), angle=st.floats(-math.pi, math.pi))
-def test_where_others_are_along_a_route_does_not_depend_on_the_frame(seed: int, angle: float) -> None:
-    parts = scene(seed)
-    there = moved(parts, angle, torch.tensor([300.0, -70.0], dtype=torch.float64))
-    torch.testing.assert_close(along_route(*there), along_route(*parts), atol=1e-6, rtol=0)
 
 
 @given(seed=st.integers(0, 10_000), faster=st.floats(0, 80))

@@ -141,14 +141,18 @@ def test_partial_reset_keeps_the_rest():
 
 @pytest.mark.parametrize("dynamics", [Bicycle(), Displacement()])
 def test_moving_the_world_changes_nothing_an_agent_sees(dynamics):
-    segment = crossing(6)
-    here = make_env(segment, dynamics=dynamics, config=ALL)
-    there = make_env(turned(segment, 2.1, (310.0, -95.0)), dynamics=dynamics, config=ALL)
-    plan = actions(here, (1, 15))
-    a, b = (run(e, e.start(torch.tensor([0])), plan) for e in (here, there))
-    for key in (keys.OWN, keys.COLLISION, keys.OFFROAD, keys.REWARD):
+    worlds = [crossing(6), turned(crossing(6), 2.1, (310.0, -95.0))]
+    more = {"route": True, "along": True, "gaps": True, "clearance": True, "foresight": (0.5, 1.0), "num_lights": 2}
+    scenes = [collate([scene(s, [0, 1], LaneGraph(s.road))]) for s in worlds]
+    here, there = (DrivingEnv(each, dynamics, replace(ALL, **more)) for each in scenes)
+    plan, starts = actions(here, (1, 15)), [e.with_goals(e.start(torch.tensor([0]))) for e in (here, there)]
+    choices = [e.choices(start)[keys.ROUTES] for e, start in zip((here, there), starts, strict=True)]
+    torch.testing.assert_close(*choices, atol=1e-3, rtol=0)
+    a, b = (run(e, start, plan) for e, start in zip((here, there), starts, strict=True))
+    for key in (keys.OWN, keys.COLLISION, keys.OFFROAD, keys.REWARD, keys.ROUTE, keys.ROAD):
         torch.testing.assert_close(a[key], b[key], atol=2e-4, rtol=0)
-    for key in (keys.OBJECTS, keys.POINTS):
+    a[keys.GAP], b[keys.GAP] = a[keys.GAP][..., None], b[keys.GAP][..., None]
+    for key in (keys.OBJECTS, keys.POINTS, keys.ALONG, keys.GAP, keys.GAP_AHEAD, keys.LIGHTS):
         # All elements fit, so pooling shows the same set whatever its order.
         torch.testing.assert_close(a[key].amax(-2), b[key].amax(-2), atol=2e-4, rtol=0)
         torch.testing.assert_close(a[key].mean(-2), b[key].mean(-2), atol=2e-4, rtol=0)

@@ -92,20 +92,6 @@ def test_seen_points_are_the_routes_points_ahead(line, where, offset, heading):
     assert (there[rows != np.full(len(rows), len(line) - 1)] > here).all()
 
 
-@given(lines, st.floats(0, 6), st.floats(-500, 500), st.floats(-500, 500))
-def test_moving_the_world_changes_no_feature(line, angle, x, y):
-    def there(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        turned = (points[..., 0] + 1j * points[..., 1]) * np.exp(1j * angle) + complex(x, y)
-        return np.stack([turned.real, turned.imag], -1)
-
-    place = line[3] + [0.4, 1.1]
-    a, b = see(*place, 0.2, line), see(*there(place), 0.2 + angle, there(line))
-    torch.testing.assert_close(a, b, atol=1e-6, rtol=0)
-    state, moved = [[[*place, 0.2, 5.0]]], [[[*there(place), 0.2 + angle, 5.0]]]
-    one, two = choices_of(torch.tensor(state).double(), line), choices_of(torch.tensor(moved).double(), there(line))
-    torch.testing.assert_close(one, two, atol=1e-6, rtol=0)
-
-
 def test_without_a_route_all_features_are_zero():
     state, none = torch.randn(2, 3, 4), torch.zeros(2, 3, dtype=torch.int64)
     for point in (torch.zeros(0, 2), 1e6 * torch.randn(50, 2)):

@@ -353,6 +353,8 @@ def test_runs_without_defined_progress_have_no_score(tmp_path: Path) -> None:
         runs = [{"segment": f"{k}", "group": f"{k % 4}", "progress_ratio": 0.5 + ahead[k % 2]} for k in range(8)]
         one |= {"per_run": [FINE | run for run in runs], "score": 50 + ahead[0]}
     assert winners([other, record])[0].startswith("log: hurries is first, within the error, 3.1 ± 1.2")
+    record["per_run"] = [run | {"progress_ratio": 0.6} for run in record["per_run"]]  # in all groups as much ahead
+    assert winners([other, record])[0].startswith("log: hurries is first, its error unknown, 10.0 above")
 
 
 def several(out: Path, segment: RunSegment, planner: Any, drives: Any, agent: Any = "playback", **how: Any):

@@ -26,6 +26,7 @@ from helpers_store import contents, stored
 from symphony import keys
 from symphony.cli import main
 from symphony.config.evaluation import EvaluateConfig, compiles
+from symphony.data.builtin import builtin_store
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation import Evaluation, evaluate
@@ -327,6 +328,16 @@ def test_workers_end_with_the_process_that_started_them(how: str, tmp_path: Path
         errors = process.stderr.read()
     assert process.returncode in {-getattr(signal, how), 128 + signal.SIGINT}
     assert errors.count("Traceback") == (how == "SIGINT")
+
+
+def test_workers_import_nothing_from_the_current_folder(tmp_path: Path) -> None:
+    """Where anything may lie; the installed command does not, either."""
+    for name in ("types.py", "random.py", "symphony.py"):
+        (tmp_path / name).write_text(f"print({name!r}, file=open('read', 'a'))")
+    given = f"simulate playback --data {builtin_store('test')} --segments 0 1 --out sim --workers 2 --batch 1".split()
+    command = [Path(sys.executable).with_name("symphony"), *given]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    assert not (tmp_path / "read").exists()
 
 
 def test_bad_arguments_are_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

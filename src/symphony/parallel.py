@@ -28,6 +28,8 @@ Engine = Literal["local", "ray"]
 IN_FLIGHT = 2  # tasks per worker that are submitted and not yet collected
 # A worker has one core: OpenMP threads of several workers would only take the cores from each other.
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+# Python looks for modules in the current folder first, where anything may lie, in a process that it starts for us.
+_SAFE = {"PYTHONSAFEPATH": "1"}
 # A fork of this very process would inherit torch's threads without their state; a server that only imports has none.
 _START: Literal["forkserver", "spawn"] = "forkserver" if sys.platform == "linux" else "spawn"
 
@@ -80,13 +82,14 @@ def get_ready(imports: Sequence[str]) -> None:
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
     """Give processes started inside the environment of workers; they put off interrupts: the parent's are enough."""
-    before = {name: os.environ[name] for name in WORKER_ENVIRONMENT if name in os.environ}
+    given = WORKER_ENVIRONMENT | _SAFE
+    before = {name: os.environ[name] for name in given if name in os.environ}
     try:
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        os.environ.update(WORKER_ENVIRONMENT)
+        os.environ.update(given)
         yield
     finally:
-        for name in WORKER_ENVIRONMENT:
+        for name in given:
             os.environ.pop(name, None)
         os.environ.update(before)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -143,6 +146,8 @@ def _local_map(function: Callable[[T], R], tasks: Iterator[T], workers: int, nam
 
 
 def _begin_worker(lifeline: Connection, environment: dict[str, str]) -> None:
+    for name in _SAFE:  # but for what a worker starts itself
+        os.environ.pop(name, None)
     os.environ.update(environment)
     threading.Thread(target=_watch, args=(lifeline,), daemon=True).start()
 

@@ -20,7 +20,7 @@ from symphony.metrics.intervals import beta_quantile, grouped_mean, t_quantile
 
 Run = dict[str, Any]
 _ALIKE = 1e-9  # standard error below which groups do not differ but by rounding
-Kind = Literal["rate", "share", "mean", "difference of rates"]
+Kind = Literal["rate", "share", "mean", "difference"]
 
 
 @dataclass(frozen=True)
@@ -90,10 +90,10 @@ def estimate(
     bounds over groups, each with a confidence between 0.5 and 1.
 
     Bounds of a mean are Student's t, with the degrees of freedom of as many equal groups as weigh alike; of a
-    difference of rates, and of shares that are the same in all groups, not nearer than the bound of a rate where
-    nothing happened; of other means that are the same, unknown. Those of a rate are the exact binomial ones of as
-    many independent runs as the scatter between groups says there are, and of as many as there are groups where
-    nothing or everything happened.
+    difference of rates or shares not nearer than the bound of a rate where nothing happened; of means that are the
+    same in all groups unknown. Those of a rate or a share, of which few runs may be far from all others, are the
+    exact binomial ones of as many independent runs as the scatter between groups says there are, and of as many as
+    there are groups where nothing or everything happened.
     """
     known = [(value, group) for value, group in zip(values, groups, strict=True) if value is not None]
     value = np.array([value for value, _ in known], np.float64)
@@ -102,14 +102,13 @@ def estimate(
     if mean is None:
         return Estimate(None, None, None, 0, 0)
     count = int(number.max()) + 1
-    if kind == "rate":
+    if kind in ("rate", "share"):
         high, low = (_rate_bound(part, number, count, confidence) for part in (value / 100, 1 - value / 100))
         return Estimate(mean, 100.0 * (1 - low), 100.0 * high, len(value), count)
-    alike = error is not None and error < _ALIKE
-    if error is None or (alike and kind == "mean"):
+    if error is None or (error < _ALIKE and kind == "mean"):
         return Estimate(mean, None, None, len(value), count)
     spread = t_quantile(confidence, len(value) ** 2 / int((np.bincount(number) ** 2).sum()) - 1) * error
-    if alike or kind == "difference of rates":
+    if kind == "difference":
         spread = max(spread, 100.0 * beta_quantile(confidence, 1, count))
     return Estimate(mean, mean - spread, mean + spread, len(value), count)
 

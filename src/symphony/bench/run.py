@@ -255,7 +255,7 @@ def judged(suite: Suite, pair: Pair, base: Sequence[Run]) -> list[Verdict]:
     for one in _thresholds(suite, pair):
         measure, sure = MEASURES[one.metric], one.confidence or 0.95
         if one.compared:
-            kind: Kind = "difference of rates" if measure.kind == "rate" else measure.kind
+            kind: Kind = "mean" if measure.kind == "mean" else "difference"
             known = estimate(*paired(pair.runs, base, measure.of), sure, kind)
         else:
             known = measured(pair.runs, measure, sure)

@@ -289,14 +289,14 @@ def _threshold(
             if name not in known:
                 raise table.wrong(key, f"there is no {name!r} among {known}")
     compared = given.get("compared", False)
-    if compared and not baseline:
-        raise table.wrong("compared", "the suite has no baseline")
-    if compared and {str(baseline)} == {*given.get("planners", names["planners"])}:
-        raise table.wrong("compared", f"{baseline} is the baseline, and not compared with itself")
+    itself = {str(baseline)} == {*given.get("planners", names["planners"])}
+    if compared and (itself or not baseline):
+        why = f"{baseline} is the baseline, and not compared with itself" if itself else "the suite has no baseline"
+        raise table.wrong("compared", why)
     if confidence is not False:
         table.check_confidence(confidence)
         needed = 2
-        if MEASURES[given["metric"]].kind == "rate" and not compared:
+        if MEASURES[given["metric"]].kind != "mean" and not compared:
             room = given[side] if side == "at_most" else 100.0 - given[side]
             if room <= 0:
                 shown = "0 %" if side == "at_most" else "at least 100 %"

@@ -88,11 +88,17 @@ def main(args: Sequence[str] | None = None) -> int:
 def settle() -> None:
     """Apply the settings of a process of our own before it loads torch; the user's settings take precedence."""
     allocator.tune()
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by who started us
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - until the end
     if isinstance(sys.stdout, io.TextIOWrapper):  # of an encoding that may lack `≤`
         sys.stdout.reconfigure(errors="backslashreplace")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin take the cores of a busy machine
     cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", os.path.join(cache, "symphony", "compiled"))
+    with contextlib.suppress(OSError):  # where it can't be written, torch has a place of its own
+        os.makedirs(place := os.path.join(cache, "symphony", "compiled"), exist_ok=True)
+        if os.path.isabs(place) and os.access(place, os.W_OK):
+            os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", place)
 
 
 def guarded(action: Callable[[], object]) -> int:

@@ -164,6 +164,7 @@ def winners(records: Sequence[Record]) -> list[str]:
         difference, error, groups = paired_difference(first, second)
         if difference is not None and difference < 0:
             first, second, difference = second, first, -difference
+        error = error if error and error > 1e-9 else None  # groups that happen to agree say nothing of it
         clear = error is not None and (difference or 0.0) > t_quantile(0.975, groups - 1) * error
         by = "–" if difference is None else f"{difference:.1f}"
         by += "" if error is None else f" ± {error:.1f}"
