@@ -14,16 +14,6 @@ from hypothesis import strategies as st
 
 import helpers_sources as sources
 from helpers_convert import FakeReader
-from helpers_sources import (
-    IN_FOLDER,
-    ROAD,
-    commonroad,
-    driver,
-    little_memory,
-    read_error,
-    womd_scenario,
-    write_records,
-)
 from symphony.data import convert as converting
 from symphony.data.convert import convert
 from symphony.data.segment import RunSegment, content_hash, validate
@@ -34,7 +24,7 @@ from symphony.data.sources.lines import drivable_rings
 from symphony.data.sources.womd import masked_crc32c
 from symphony.errors import DataError
 
-GOOD = commonroad(ROAD, driver(7), driver(8, x=20))
+GOOD = sources.commonroad(sources.ROAD, sources.driver(7), sources.driver(8, x=20))
 
 
 def read_all(name: str, path: Path) -> list[Item]:
@@ -64,7 +54,7 @@ def test_things_that_are_no_files_of_the_format(name: str, tmp_path: Path) -> No
     expected = {tmp_path: "folder", tmp_path / "nowhere": "No such file", empty: "empty"}
     expected |= {noise: "", text: ""}
     for path, message in expected.items():
-        error = read_error(name, path)
+        error = sources.read_error(name, path)
         assert error.file == path
         assert message in error.message
 
@@ -72,8 +62,8 @@ def test_things_that_are_no_files_of_the_format(name: str, tmp_path: Path) -> No
 @pytest.fixture
 def shard(tmp_path: Path) -> bytes:
     """Three small records."""
-    scenarios = [womd_scenario(f"{k:016x}", tracks=1 + k, steps=3) for k in range(3)]
-    write_records(tmp_path / "shard", [scenario.SerializeToString() for scenario in scenarios])
+    scenarios = [sources.womd_scenario(f"{k:016x}", tracks=1 + k, steps=3) for k in range(3)]
+    sources.write_records(tmp_path / "shard", [scenario.SerializeToString() for scenario in scenarios])
     return (tmp_path / "shard").read_bytes()
 
 
@@ -85,7 +75,7 @@ def ends(shard: bytes) -> list[int]:
     return found
 
 
-@IN_FOLDER
+@sources.IN_FOLDER
 @given(data=st.data())
 def test_womd_cut_anywhere_or_with_a_flipped_bit(data: st.DataObject, shard: bytes, tmp_path: Path) -> None:
     whole, places, path = hashes(read_all("womd", tmp_path / "shard")), ends(shard), tmp_path / "shard"
@@ -110,7 +100,7 @@ def test_womd_cut_anywhere_or_with_a_flipped_bit(data: st.DataObject, shard: byt
 def test_a_huge_length_is_not_allocated(tmp_path: Path) -> None:
     head, path = struct.pack("<Q", 2**62), tmp_path / "a"
     path.write_bytes(head + struct.pack("<I", masked_crc32c(head)) + b"abc\0\0\0\0")
-    assert "cut short" in read_error("womd", path).message
+    assert "cut short" in sources.read_error("womd", path).message
 
 
 def laughs() -> str:
@@ -128,14 +118,14 @@ def test_commonroad_document_types_are_refused(attack: str, encoding: str, tmp_p
     path = tmp_path / "a.xml"
     text = head.replace("UTF-8", encoding) + attack + body.replace("ZAM_Made", "&e19;", 1)
     path.write_bytes(text.encode(encoding))
-    error = read_error("commonroad", path)
+    error = sources.read_error("commonroad", path)
     assert (error.field, error.file) == ("DOCTYPE", path)
 
 
 @pytest.mark.parametrize(("text", "field", "message"), [
-    (commonroad(driver(7)), "lanelet", "has no lanes"),
-    (commonroad(ROAD), "dynamicObstacle", "has no dynamic obstacles"),
-    (commonroad(ROAD, driver(7, speed=0)), "dynamicObstacle", "no moving vehicle"),
+    (sources.commonroad(sources.driver(7)), "lanelet", "has no lanes"),
+    (sources.commonroad(sources.ROAD), "dynamicObstacle", "has no dynamic obstacles"),
+    (sources.commonroad(sources.ROAD, sources.driver(7, speed=0)), "dynamicObstacle", "no moving vehicle"),
     (GOOD.replace("2020a", "2017a"), "commonRoadVersion", "2018b or 2020a"),
     (GOOD.replace('timeStepSize="0.1"', ""), "timeStepSize", "not a number"),
     (GOOD.replace('timeStepSize="0.1"', 'timeStepSize="nan"'), "timeStepSize", "not finite"),
@@ -143,12 +133,12 @@ def test_commonroad_document_types_are_refused(attack: str, encoding: str, tmp_p
     (GOOD.replace("<length>4.5", "<length>0", 1), "size", "must be positive"),
     (GOOD.replace('lanelet id="11"', 'lanelet id="10"'), "road.lane_id", "not unique"),
     (GOOD.replace('Obstacle id="8"', 'Obstacle id="7"'), "agent_id", "not unique"),
-    (commonroad(ROAD, driver(7, x=1e6), driver(8)), "position", "not re-centred"),
+    (sources.commonroad(sources.ROAD, sources.driver(7, x=1e6), sources.driver(8)), "position", "not re-centred"),
 ])  # fmt: skip
 def test_commonroad_errors_are_named(text: str, field: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "a.xml"
     path.write_text(text)
-    error = read_error("commonroad", path)
+    error = sources.read_error("commonroad", path)
     assert error.file == path
     assert error.field == field
     assert message in error.message
@@ -171,9 +161,9 @@ def test_commonroad_errors_are_named(text: str, field: str, message: str, tmp_pa
 ])  # fmt: skip
 def test_commonroad_odd_things(old: str, new: str, kind: str, example: str, tmp_path: Path) -> None:
     cycle = "<cycle><cycleElement><duration>3</duration><color>red</color></cycleElement></cycle>"
-    more = ROAD.replace('<predecessor ref="10"/>', '<trafficLightRef ref="30"/>')
+    more = sources.ROAD.replace('<predecessor ref="10"/>', '<trafficLightRef ref="30"/>')
     light = f'<trafficLight id="30">{cycle}</trafficLight>'
-    whole = commonroad(more, driver(7), driver(8, x=20), light)
+    whole = sources.commonroad(more, sources.driver(7), sources.driver(8, x=20), light)
     path = tmp_path / "a.xml"
     path.write_text(whole.replace(old, new, 1))
     found = sources.read_one("commonroad", path)
@@ -189,14 +179,14 @@ def test_commonroad_odd_things(old: str, new: str, kind: str, example: str, tmp_
 def test_many_parked_cars_one_late_state_and_files_beyond_all_measure(tmp_path, monkeypatch):
     path = tmp_path / "a.xml"
     parked = [sources.obstacle(100 + k, [sources.state(0, k, 5)], role="static") for k in range(700)]
-    late = driver(7).replace("<exact>4</exact>", "<exact>9900</exact>", 1)
-    path.write_text(commonroad(ROAD, late, driver(8), *parked))
-    with little_memory(40e6):
-        error = read_error("commonroad", path)
+    late = sources.driver(7).replace("<exact>4</exact>", "<exact>9900</exact>", 1)
+    path.write_text(sources.commonroad(sources.ROAD, late, sources.driver(8), *parked))
+    with sources.little_memory(40e6):
+        error = sources.read_error("commonroad", path)
     assert error.field == "time"
     assert "states" in error.message
     monkeypatch.setattr("symphony.data.sources.base.MAX_FILE", path.stat().st_size - 1)
-    assert "too large" in read_error("commonroad", path).message
+    assert "too large" in sources.read_error("commonroad", path).message
 
 
 def test_outlines_that_cross_without_end() -> None:
@@ -214,9 +204,9 @@ def test_outlines_that_cross_without_end() -> None:
 
 
 def test_records_that_are_too_large_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    big, small = (womd_scenario(f"of-{n}", tracks=n).SerializeToString() for n in (9, 2))
+    big, small = (sources.womd_scenario(f"of-{n}", tracks=n).SerializeToString() for n in (9, 2))
     monkeypatch.setattr(womd, "MAX_RECORD", len(big) - 1)
-    write_records(tmp_path / "a", [big, small])
+    sources.write_records(tmp_path / "a", [big, small])
     error, item = get_reader("womd").read(tmp_path / "a")
     assert (error.field, item.segment_id) == ("record 0", "of-2")
 
@@ -235,13 +225,13 @@ def test_argoverse_rows_and_texts_beyond_all_measure(tmp_path: Path) -> None:
         (texts, "scenario_id", "a text of more than 64 characters"), (rows, None, "500001 rows"),
     ):  # fmt: skip
         parquet.write_table(pa.table(columns), path)
-        with little_memory(100e6):
-            error = read_error("argoverse2", path)
+        with sources.little_memory(100e6):
+            error = sources.read_error("argoverse2", path)
         assert field in (None, error.field)
         assert message in error.message
     columns = helpers.scenario()
     columns["track_id"] = [[name] for name in columns["track_id"]]
-    error = read_error("argoverse2", helpers.write(tmp_path, columns))
+    error = sources.read_error("argoverse2", helpers.write(tmp_path, columns))
     assert (error.field, error.message) == ("track_id", "expected string, is list<element: string>")
 
 
@@ -295,7 +285,7 @@ def test_reports_that_are_none(change: dict[str, object], tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("field", ["exit_lanes", "lane_states", "map_features", "objects_of_interest"])
 def test_womd_lists_without_end(field: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scenario = womd_scenario()
+    scenario = sources.womd_scenario()
     monkeypatch.setattr(womd, "MAX_LINKS", 1000)
     monkeypatch.setattr(womd, "MAX_FEATURES", 1000)
     lights = scenario.dynamic_map_states[0].lane_states
@@ -306,5 +296,5 @@ def test_womd_lists_without_end(field: str, tmp_path: Path, monkeypatch: pytest.
         "objects_of_interest": (scenario.objects_of_interest, 100),
     }[field]
     entries.extend([entry] * 5001)  # type: ignore[attr-defined]
-    write_records(tmp_path / "a", [scenario.SerializeToString()])
-    assert "entries, at most" in read_error("womd", tmp_path / "a").message
+    sources.write_records(tmp_path / "a", [scenario.SerializeToString()])
+    assert "entries, at most" in sources.read_error("womd", tmp_path / "a").message

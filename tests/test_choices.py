@@ -104,6 +104,7 @@ def test_turns_do_not_depend_on_where_a_route_lies(turn: float, angle: float, sh
     assert (both - 1).tolist() == 3 * [[[wanted, -wanted], [-wanted, wanted]]]
     # What lies past the end of a route is no part of it.
     assert route_turns(routes, torch.tensor([9, 9])).tolist() == [1, 1]
+    assert route_turns(routes[:, :2], torch.tensor([2, 2])).tolist() == [1, 1]
 
 
 def test_by_hand() -> None:

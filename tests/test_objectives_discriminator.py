@@ -80,6 +80,7 @@ def test_a_kind_that_is_absent_adds_nothing():
     assert out["gradient_penalty"] == 0
     assert all(out[key].isnan() for key in ("accuracy_data", "score_data", "auc"))
     assert out["accuracy_simulated"].isfinite()
+    assert DiscriminatorLoss(network, **PENALTY)(td[:0])["loss_discriminator"] == 0
     td[VALID] = torch.zeros_like(td[VALID])
     loss = DiscriminatorLoss(network, **PENALTY)(td)["loss_discriminator"]
     assert loss == 0

@@ -25,14 +25,7 @@ from symphony.config import EvaluateConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
-from symphony.evaluation.planners import (
-    check_crowds,
-    paired_difference,
-    planner_record,
-    planners_text,
-    run_score,
-    winners,
-)  # fmt: skip
+from symphony.evaluation import planners as compared
 from symphony.learning.demonstrations import SceneDataset
 from symphony.planners.interface import Control, Pose, Scenario, Traffic, checked_plan, scenario_of
 from symphony.planners.view import FunctionPlanner, Observation, lanes_of
@@ -240,6 +233,12 @@ def test_the_observation_is_all_in_si_units(store: Path, tmp_path: Path) -> None
                 np.testing.assert_array_equal(mine, other)
 
 
+def test_only_the_ego_is_told_the_goal_of_its_planning_problem() -> None:
+    segment = straight_road(3).replace(goal=[1.0, 2.0])
+    goals = [scenario_of(segment, k, np.zeros((0, 2)), np.zeros(4), 0).goal for k in (segment.ego, 2)]
+    np.testing.assert_allclose(goals, [segment.goal, segment.position[2, -1, :2]])
+
+
 def test_bounds_and_neighbours_of_lanes() -> None:
     """Bounds lie half a width beside the centre line, by shapely, on its two sides; links are those of the map."""
     for segment, lost in ((straight_road(3), False), (crossing(4), False), (crossing(4), True)):
@@ -273,7 +272,7 @@ FINE = dict.fromkeys(("failed", "at_fault_collision", "red_lights", "beyond_rout
     ({"progress_ratio": None, "logged_steps": 0}, None),
 ])  # fmt: skip
 def test_the_score_of_a_run(changes: dict[str, Any], score: float | None) -> None:
-    assert run_score({**FINE, "progress_ratio": 0.5, **changes}) == score
+    assert compared.run_score({**FINE, "progress_ratio": 0.5, **changes}) == score
 
 
 def test_the_command_compares_planners_among_crowds(store, tmp_path, capsys):
@@ -284,39 +283,39 @@ def test_the_command_compares_planners_among_crowds(store, tmp_path, capsys):
     capsys.readouterr()
     assert main(["planners", *places, "--json", "-"]) == 0
     records = json.loads(capsys.readouterr().out)["records"]
-    assert records == [planner_record(load_rollouts(place)) for place in places]
+    assert records == [compared.planner_record(load_rollouts(place)) for place in places]
     assert [(one["planner"], len(one["per_run"])) for one in records] == [("idm", 4), ("log", 4)]
     assert main(["planners", *places]) == 0
     table = capsys.readouterr().out.splitlines()
     # What a suite does not save is as usual; beside the log, who enters and which lights counts, too.
     saved = dict(records[0]["settings"])
     del saved["lights"], saved["after_collision"]
-    check_crowds([records[0] | {"settings": saved}, records[1]])
+    compared.check_crowds([records[0] | {"settings": saved}, records[1]])
     for more in ({"inflow": 1.0}, {"lights": [5.0, 1.0, 1.0]}, {"drives": {"3": "idm"}}):
         beside = [one | {"crowd": "playback"} for one in records]
         beside[1]["settings"] = beside[1]["settings"] | more
         with pytest.raises(ConfigError, match=next(iter(more))):
-            check_crowds(beside)
+            compared.check_crowds(beside)
     for alone in (["--others", "idm"], ["--after-collision", "stop"]):
         assert main(["simulate", "playback", *alone, *words, "--out", str(tmp_path / "alone")]) == 1
         assert "is all log" in capsys.readouterr().err
     assert re.match(r"\| crowd +\| +planner \| +score \|", table[0])
     assert sorted(line.split("|")[2].strip() for line in table[2:4]) == ["idm", "log"]
-    assert table[-1] == winners(records)[0]
+    assert table[-1] == compared.winners(records)[0]
     assert main(["planners", str(store)]) == 1
     with pytest.raises(DataError, match="no planner drove here"):
-        planner_record(run(store, tmp_path / "bare", ""))
+        compared.planner_record(run(store, tmp_path / "bare", ""))
 
 
 def test_a_segment_that_failed_is_no_recording_of_its_own(tmp_path: Path) -> None:
     late = hide(straight_road(3, seed=5, steps=11), 0, slice(0, 2))
     found = zip([crossing(3, steps=11), late, straight_road(3, steps=11)], "aab", strict=True)
     fill(tmp_path / "store", [segment.replace(group=group) for segment, group in found])
-    record = planner_record(alone(tmp_path / "store", tmp_path / "sim", "log"))
+    record = compared.planner_record(alone(tmp_path / "store", tmp_path / "sim", "log"))
     assert {bool(one["failed"]): one["group"] for one in record["per_run"][1:]} == {False: "b", True: "a"}
     apart = {"a": 0.0, "b": 0.0}
     for one in record["per_run"]:
-        apart[one["group"]] += (run_score(one) - record["score"]) / 1.5
+        apart[one["group"]] += (compared.run_score(one) - record["score"]) / 1.5
     assert record["score_se"] == pytest.approx(np.sqrt(sum(x**2 for x in apart.values()) / 2))
 
 
@@ -332,7 +331,7 @@ def test_runs_without_defined_progress_have_no_score(tmp_path: Path) -> None:
 
     where = {"way": (0, 10), "beside": (200, 10), "stands": (200, 0), "end": (0, 10, 30)}
     fill(tmp_path / "store", [driven(name, *place) for name, place in where.items()])
-    record = planner_record(alone(tmp_path / "store", tmp_path / "sim", lambda seen: Control(5.0, 0.0)))
+    record = compared.planner_record(alone(tmp_path / "store", tmp_path / "sim", lambda seen: Control(5.0, 0.0)))
     runs = {one["segment"]: one for one in record["per_run"]}
     names = ("progress_ratio", "beyond_route", "no_route")
     found = {key: tuple(one[name] for name in names) for key, one in runs.items()}
@@ -341,20 +340,20 @@ def test_runs_without_defined_progress_have_no_score(tmp_path: Path) -> None:
     assert (record["score"], record["score_runs"]) == (pytest.approx(100, abs=0.01), 2)
     assert record["progress_ratio"] == runs["way"]["progress_ratio"]
     record["planner"] = "hurries"
-    lost = [one for one in record["per_run"] if run_score(one) is None]
+    lost = [one for one in record["per_run"] if compared.run_score(one) is None]
     other = record | {"planner": "none", "score": None, "per_run": lost}
-    lines = [re.split(r" *\| *", line)[2:5] for line in planners_text([other, record]).splitlines()[2:4]]
+    lines = [re.split(r" *\| *", line)[2:5] for line in compared.planners_text([other, record]).splitlines()[2:4]]
     assert lines == [["hurries", "100.0 ± 0.0", "2"], ["none", "–", "2"]]
-    assert paired_difference(record, other) == (None, None, 0)
-    assert winners([other, record])[0].startswith("log: hurries is first, its error unknown, –")
-    assert "is level with same" in winners([record, record | {"planner": "same"}])[0]
+    assert compared.paired_difference(record, other) == (None, None, 0)
+    assert compared.winners([other, record])[0].startswith("log: hurries is first, its error unknown, –")
+    assert "is level with same" in compared.winners([record, record | {"planner": "same"}])[0]
     # Ahead by 2.7 standard errors over four recordings, where Student's t of 3 degrees asks for 3.2.
     for one, ahead in ((record, (0.0112, 0.0512)), (other, (0.0, 0.0))):
         runs = [{"segment": f"{k}", "group": f"{k % 4}", "progress_ratio": 0.5 + ahead[k % 2]} for k in range(8)]
         one |= {"per_run": [FINE | run for run in runs], "score": 50 + ahead[0]}
-    assert winners([other, record])[0].startswith("log: hurries is first, within the error, 3.1 ± 1.2")
+    assert compared.winners([other, record])[0].startswith("log: hurries is first, within the error, 3.1 ± 1.2")
     record["per_run"] = [run | {"progress_ratio": 0.6} for run in record["per_run"]]  # in all groups as much ahead
-    assert winners([other, record])[0].startswith("log: hurries is first, its error unknown, 10.0 above")
+    assert compared.winners([other, record])[0].startswith("log: hurries is first, its error unknown, 10.0 above")
 
 
 def several(out: Path, segment: RunSegment, planner: Any, drives: Any, agent: Any = "playback", **how: Any):

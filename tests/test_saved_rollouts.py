@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -110,6 +111,9 @@ def test_another_simulation_or_folder_is_refused(tmp_path):
         more = dataclasses.replace(ABOUT, settings={**ABOUT.settings, "lights": lights, "after_collision": "go-on"})
         with pytest.raises(DataError, match=r"settings\.lights$") if lights else contextlib.nullcontext():
             RolloutWriter(tmp_path / "sim", more).close()
+    with patch("symphony.saved.folder.write_json", side_effect=OSError("full")), pytest.raises(OSError, match="full"):
+        RolloutWriter(tmp_path / "full", ABOUT)
+    RolloutWriter(tmp_path / "full", ABOUT).close()
     (tmp_path / "shop").mkdir()
     (tmp_path / "shop" / "index.jsonl").write_text(foreign := '{"price": 1}\n{"price"')
     with pytest.raises(DataError, match="refusing"):

@@ -1,12 +1,15 @@
-"""One writer for each output: another one is refused by name (docs/determinism.md)."""
+"""One writer for each output: another is refused by name (docs/determinism.md); a machine that lacks something."""
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -16,10 +19,12 @@ from helpers_saved import searched
 from helpers_store import contents
 from symphony.cli import main
 from symphony.data.builtin import builtin_store
-from symphony.errors import DataError
+from symphony.data.generate import Plan, generate
+from symphony.errors import DataError, SymphonyError
 from symphony.files import Lock, lock_file
 from symphony.recipes import train
 from symphony.saved.folder import RolloutWriter, load_rollouts, save_rollouts
+from test_generate import needs_sumo
 
 STORE = ["--data", str(builtin_store("test"))]
 SHORT = ["--segments", "0", "--duration", "1"]
@@ -125,3 +130,15 @@ def test_no_two_have_it_at_once(tmp_path: Path) -> None:
     for process in processes:
         process.join(60)
     assert [process.exitcode for process in processes] == [0, 0, 0]
+
+
+@needs_sumo
+def test_what_the_machine_lacks_ends_a_generation_and_costs_no_network(tmp_path: Path) -> None:
+    full, late = OSError(errno.ENOSPC, "No space left on device"), subprocess.TimeoutExpired("sumo", 600)
+    for fault in (OSError(errno.EMFILE, "Too many open files"), late, [subprocess.CompletedProcess([], -9)], full):
+        where = (Path, "write_bytes") if fault is full else (subprocess, "run")  # there the programs say nothing
+        with patch.object(*where, side_effect=fault), pytest.raises((SymphonyError, OSError)) as error:
+            generate(Plan(1), tmp_path)
+        assert not isinstance(error.value, DataError)
+    state = generate(Plan(1), tmp_path)
+    assert (state.networks, state.failed) == (1, {})

@@ -95,10 +95,8 @@ def settle() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin take the cores of a busy machine
     cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    with contextlib.suppress(OSError):  # where it can't be written, torch has a place of its own
-        os.makedirs(place := os.path.join(cache, "symphony", "compiled"), exist_ok=True)
-        if os.path.isabs(place) and os.access(place, os.W_OK):
-            os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", place)
+    if os.access(cache if os.path.isdir(cache) else os.path.dirname(cache), os.W_OK):  # else torch has a place
+        os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", os.path.join(cache, "symphony", "compiled"))
 
 
 def guarded(action: Callable[[], object]) -> int:

@@ -36,7 +36,7 @@ class Backtrack:
     Args:
         threshold: the threshold in the units of the totals.
         back: periods of each try, counted from the end of the bad one (1 repeats that alone); 0 for the first state.
-        cap: bound on what is simulated again, in lengths of a line.
+        cap: lengths of a line that are simulated again, from which on it goes back no more.
         renew: ``renew(state, attempt) -> state`` makes the state [R, 1] that lines go on from. It gets the kept
             entries of the step they go back to and how often each line [R] has gone back so far, and must give them
             other random numbers than before, and what was not kept of the entries that the start state has. None

@@ -131,7 +131,7 @@ class TrainConfig(RunConfig):
     together: Annotated[Natural, Suppress] = 0
     states: Count = 1024  # Expert states per update, drawn from those segments.
     perturb: PerturbConfig = field(default_factory=PerturbConfig)  # Displaced expert states.
-    learning_rate: Positive = 1e-2  # Learning rate of Adam, falling to a tenth along a cosine.
+    learning_rate: Positive = 1e-2  # Learning rate of Adam (the discriminator's is 0.001), which falls to a tenth.
     #: The beam search (methods with TS; MGAIL without TS simulates as many rollouts and keeps all).
     search: SearchConfig = field(default_factory=SearchConfig)
     #: The discriminator (methods with TS, and MGAIL).

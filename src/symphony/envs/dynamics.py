@@ -154,7 +154,7 @@ class Bicycle:
 
         Continues from the *fitted* state, so errors do not accumulate unseen. Where the next logged step is not valid
         the agent keeps its speed and course, and where it reappears the fit starts again from the log. Returns joint
-        action indices [*b, T - 1] and fitted states [*b, T, 4].
+        action indices [*b, T - 1] and fitted states [*b, T, 4]; T is at least 2.
         """
         acceleration, steering = self.grid(log)
         effort = self.effort**2 * (acceleration.square() + (10.0 * steering).square())
@@ -198,7 +198,7 @@ class Displacement:
     def fit(
         self, log: Float[Tensor, "*b T 4"], valid: Bool[Tensor, "*b T"], size: Sizes, dt: float
     ) -> tuple[Float[Tensor, "*b Tm1 2"], Float[Tensor, "*b T 4"]]:
-        """Return displacements that reach every valid logged position exactly; headings follow from the motion."""
+        """Return displacements that reach every valid logged position exactly, headings along them; T is 2 or more."""
 
         def exact(state: Tensor, target: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
             coast = torch.stack([state[..., 3] * dt, torch.zeros_like(state[..., 3])], -1)

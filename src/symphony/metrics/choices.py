@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from symphony.geometry import wrap
 
@@ -28,7 +29,7 @@ def route_turns(
     """
     step = points.diff(dim=-2)
     direction = torch.atan2(step[..., 1], step[..., 0])
-    change = wrap(direction.diff(dim=-1)).cumsum(-1)
+    change = functional.pad(wrap(direction.diff(dim=-1)).cumsum(-1), (0, 1))  # two points turn nowhere
     exists = torch.arange(change.shape[-1], device=points.device) < (count[..., None] - 2)
     turns = (change.abs() > turned) & exists
     first = turns.int().argmax(-1, keepdim=True)

@@ -161,5 +161,5 @@ def _squared_norm(
             raise ValueError(
                 f"a penalised input has shape {tuple(gradient.shape)}, expected {tuple(logit.shape)} in front"
             )
-        squared = squared + gradient.reshape(*logit.shape, -1).square().sum(-1)
+        squared = squared + gradient[..., None].square().flatten(logit.ndim).sum(-1)
     return squared

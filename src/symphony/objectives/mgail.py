@@ -23,7 +23,7 @@ from symphony.programs import compiled, ordered
 Cost = Literal["log_d", "non_saturating", "logit"]
 COSTS = {"log_d": functional.logsigmoid, "non_saturating": functional.softplus, "logit": lambda score: score}
 """Costs of a state with logit x, D = sigmoid(x) the probability that it is simulated: log D (the paper), whose
-gradient vanishes where D is sure of the log; -log(1 - D), where D is fooled; x, nowhere."""
+gradient vanishes where D is sure of the simulation; -log(1 - D), where D is sure of the log; x, nowhere."""
 
 
 class MGAILLoss(MaskedLoss):

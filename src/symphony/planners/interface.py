@@ -275,7 +275,7 @@ def scenario_of(segment: RunSegment, ego: int, route: NDArray[Any], state: NDArr
         size=fixed(segment.size[ego, :2].astype(np.float64)),
         state=fixed(state.astype(np.float64)),
         route=fixed(route.astype(np.float64)),
-        goal=fixed(np.array(segment.goal or position[np.flatnonzero(valid)[-1]])),
+        goal=fixed(np.array((ego == segment.ego and segment.goal) or position[np.flatnonzero(valid)[-1]])),
         road=_fixed_road(segment.road),
         signal_lane=fixed(segment.signal_lane),
         signal_point=fixed(segment.signal_point[:, :2].astype(np.float64)),

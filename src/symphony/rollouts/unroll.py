@@ -53,7 +53,7 @@ def simulate(
     steps: int | None = None,
 ) -> Rollouts:
     """Roll a policy, which writes the action, out from a start state of :meth:`DrivingEnv.start` of any batch shape,
-    by default up to the last logged step of the longest scene.
+    at least one step, by default up to the last logged step of the longest scene.
 
     Only states and flags are kept: the observations of sixteen rollouts would take gigabytes.
     """

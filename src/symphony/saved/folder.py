@@ -116,16 +116,17 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
                 changed.remove("settings")
                 changed += [f"settings.{n}" for n in {**now, **before} if now.get(n) != before.get(n)]
             # An empty folder belongs to no simulation.
-            if changed and (_read_index(self.path) or any((self.path / SEGMENTS).glob("*"))):
+            begun = (self.path / INDEX).exists() and _read_index(self.path)
+            if changed and (begun or any((self.path / SEGMENTS).glob("*"))):
                 message = f"holds the rollouts of another simulation, which differs in {', '.join(changed)}"
                 raise DataError(message, file=file, field=changed[0].partition(".")[0])
+        if changed:  # first: a folder with others' files and no manifest is refused
+            write_json(file, manifest)
         with naming(self.path):
             (self.path / SEGMENTS).mkdir(exist_ok=True)
             with (self.path / INDEX).open("ab+") as index:  # a line that was not finished is cut off
                 index.seek(0)
                 index.truncate(index.read().rfind(b"\n") + 1)
-        if changed:
-            write_json(file, manifest)
         self._entries = _read_index(self.path)
 
     def __exit__(self, *error: object) -> None:

@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 
 from symphony.data import store_format
-from symphony.errors import DataError
+from symphony.errors import DataError, SymphonyError
 
 TIMEOUT_SECONDS = 600.0
 SCRATCH = "symphony-sumo-"
@@ -60,7 +60,9 @@ def sumo_version() -> str:
 
 
 def run_program(name: str, arguments: str, folder: Path) -> None:
-    """Run one of SUMO's programs in a folder; a :class:`DataError` ends with what it said where it failed."""
+    """Run one of SUMO's programs in a folder; a :class:`DataError` ends with what it said where it failed. What the
+    machine lacked is an OSError, or a :class:`SymphonyError` if the program was stopped.
+    """
     home = sumo_home()
     command = [str(home / "bin" / name), *arguments.split(), "--xml-validation", "never"]
     env = {**os.environ, "SUMO_HOME": str(home)}
@@ -68,7 +70,12 @@ def run_program(name: str, arguments: str, folder: Path) -> None:
         done = subprocess.run(  # noqa: S603 - the program comes from the installed wheel and the arguments are ours
             command, cwd=folder, env=env, check=False, capture_output=True, errors="replace", timeout=TIMEOUT_SECONDS
         )
-    except (subprocess.TimeoutExpired, OSError) as error:
-        raise DataError(f"{name} could not be run: {error}") from error
+    except subprocess.TimeoutExpired as error:
+        raise SymphonyError(f"{name} took more than {TIMEOUT_SECONDS:g} s") from error
+    if done.returncode < 0:
+        raise SymphonyError(f"{name} was killed by signal {-done.returncode} (out of memory?)")
     if done.returncode != 0:
         raise DataError(f"{name} failed with exit status {done.returncode}:\n{done.stderr[-4000:].strip()}")
+    # On a full disk they end as if all were well, with files that are cut off.
+    (folder / "room").write_bytes(bytes(1 << 16))
+    (folder / "room").unlink()
