@@ -114,6 +114,8 @@ def test_another_simulation_or_folder_is_refused(tmp_path):
     with patch("symphony.saved.folder.write_json", side_effect=OSError("full")), pytest.raises(OSError, match="full"):
         RolloutWriter(tmp_path / "full", ABOUT)
     RolloutWriter(tmp_path / "full", ABOUT).close()
+    (tmp_path / "full" / "index.jsonl").unlink()  # as if there had been no room for it
+    RolloutWriter(tmp_path / "full", dataclasses.replace(ABOUT, seed=7)).close()
     (tmp_path / "shop").mkdir()
     (tmp_path / "shop" / "index.jsonl").write_text(foreign := '{"price": 1}\n{"price"')
     with pytest.raises(DataError, match="refusing"):

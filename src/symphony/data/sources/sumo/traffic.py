@@ -196,8 +196,7 @@ def simulate_traffic(
         f"--duration-log.disable true --device.fcd.begin {warm_up:.1f} --fcd-output tracks.csv "
         "--fcd-output.attributes x,y,angle --fcd-output.skip-empty true "
     )
-    # Who finds no room must not keep all others out who start on that edge.
-    arguments += "--lateral-resolution 0.5 --eager-insert true" if sublane else "--lanechange.duration 3"
+    arguments += "--lateral-resolution 0.5" if sublane else "--lanechange.duration 3"
     run_program("sumo", arguments, folder)
     time = warm_up + STEP * np.arange(round((duration - warm_up) / STEP), dtype=np.float64)
     front, angle = _read_tracks(folder / "tracks.csv", time, len(size))
