@@ -198,7 +198,7 @@ class Displacement:
     def fit(
         self, log: Float[Tensor, "*b T 4"], valid: Bool[Tensor, "*b T"], size: Sizes, dt: float
     ) -> tuple[Float[Tensor, "*b Tm1 2"], Float[Tensor, "*b T 4"]]:
-        """Return displacements that reach every valid logged position exactly, headings along them; T is 2 or more."""
+        """Return displacements reaching each valid logged position exactly, headings along them; T is at least 2."""
 
         def exact(state: Tensor, target: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
             coast = torch.stack([state[..., 3] * dt, torch.zeros_like(state[..., 3])], -1)
