@@ -31,7 +31,7 @@ from symphony.data import generate as generation
 from symphony.data.builtin import builtin_store
 from symphony.data.conformance import check_segments
 from symphony.data.generate import MAX_SEED, PRESETS, SPLITS, Harvest, Plan, Split, Task, generate
-from symphony.data.segment import RoadMap, RunSegment, SignalState, content_hash
+from symphony.data.segment import AgentType, MarkType, RoadMap, RunSegment, SignalState, content_hash
 from symphony.data.selection import MOVING, exclusion, interactive_agents, travel
 from symphony.data.sources import sumo
 from symphony.data.sources.sumo import process
@@ -300,6 +300,19 @@ def test_cars_at_the_kerb_stand_partly_on_lanes_and_others_pass_them(simulated: 
 
 
 @needs_sumo
+def test_people_walk_beside_the_road_and_cross_it_at_crosswalks(simulated: dict[str, list[RunSegment]]) -> None:
+    crossed = cycled = 0
+    for s in simulated["street-1"]:
+        spots = s.position[s.valid & (s.agent_type == AgentType.PEDESTRIAN)[:, None], :2]
+        rings = [s.road.marks[k][:, :2] for k in np.flatnonzero(s.road.mark_type == MarkType.CROSSWALK)]
+        on_marks = shapely.contains_xy(shapely.union_all(shapely.polygons(rings)).buffer(0.3), *spots.T)
+        assert (on_marks | (off_road(s.road, spots) > 0)).mean() > 0.99
+        crossed, cycled = crossed + on_marks.sum(), cycled + (s.agent_type == AgentType.CYCLIST).sum()
+    assert crossed > 50
+    assert cycled > 5
+
+
+@needs_sumo
 def test_who_is_told_to_drive_or_stand_in_a_street_does(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = list[NDArray[np.bool_]]()
     monkeypatch.setattr(sumo, "cut_segments", lambda _, __, traffic, *___: seen.append(traffic.present) or ([], {}))
@@ -332,6 +345,7 @@ def test_segments_conform_and_keep_the_exclusions(driven: list[RunSegment]) -> N
         assert np.linalg.norm(gap, axis=-1).max() < 0.5
         both = segment.valid[:, 1:] & segment.valid[:, :-1]
         assert np.linalg.norm(np.diff(segment.velocity, axis=1), axis=-1)[both].max() < 7.6 * segment.dt
+        both &= (segment.agent_type != AgentType.PEDESTRIAN)[:, None]  # who turn on the spot
         assert np.abs(np.diff(segment.heading, axis=1))[both].max() < 1.65 * segment.dt
 
 
@@ -375,7 +389,7 @@ def test_nobody_drives_over_a_red_light(driven: list[RunSegment]) -> None:
     crossings = offences = waited = 0
     for s in driven:
         along = np.stack([np.cos(s.heading), np.sin(s.heading)], -1)
-        nose = s.position[..., :2] + s.size[:, None, :1] / 2 * along
+        nose, drives = s.position[..., :2] + s.size[:, None, :1] / 2 * along, s.agent_type != AgentType.PEDESTRIAN
         for q, lane in enumerate(s.signal_lane):
             away, pace = np.linalg.norm(nose - s.signal_point[q, :2], axis=-1), np.linalg.norm(s.velocity, axis=-1)
             for green in (
@@ -386,7 +400,7 @@ def test_nobody_drives_over_a_red_light(driven: list[RunSegment]) -> None:
                 assert (pace[waits, green] < 0.1).all()
             line = shapely.LineString(s.road.lanes[lane][:, :2])
             on = (shapely.distance(line, shapely.points(nose)) < 0.6) & s.valid
-            crossed = on[:, 12:] & ~on[:, 11:-1] & s.valid[:, 11:-1]
+            crossed = on[:, 12:] & ~on[:, 11:-1] & s.valid[:, 11:-1] & drives[:, None]
             for agent, step in zip(*np.nonzero(crossed), strict=True):
                 near = np.linalg.norm(nose[agent, step + 11] - s.signal_point[q, :2]) < 4
                 red = (s.signal_state[:, step + 2 : step + 12] == SignalState.STOP).all(1)
@@ -530,7 +544,8 @@ def test_only_lanes_for_cars_count_on_either_side_of_the_road(tmp_path: Path, mo
     assert generate(Plan(1, kinds=(str(file),)), tmp_path / "store").complete
     (segment,) = SegmentStore(tmp_path / "store")
     assert segment.road.lane_width == pytest.approx(3.2)
-    assert off_road(segment.road, segment.road.marks.points[:, :2]).min() > -0.01  # stop signs
+    signs = segment.road.marks.points[np.repeat(segment.road.mark_type, np.diff(segment.road.marks.offsets)) == 5]
+    assert off_road(segment.road, signs[:, :2]).min() > -0.01
     check_segments([segment])
 
 

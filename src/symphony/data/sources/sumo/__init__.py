@@ -74,12 +74,12 @@ def generate_run(
             slow_bends(file)
         # On the user's own roads traffic comes from where streets begin at the edge of the map, and circulates.
         through = ramp or (own and bool(network.sources()))
-        parked = kind == "street"
-        sublane = bool(drive_rng.random() < SUBLANE_SHARE) or parked
+        street = kind == "street"
+        sublane = bool(drive_rng.random() < SUBLANE_SHARE) or street
         warm_up = WARM_UP * (_OWN_FILLS if own else 1) + longer / _SLOW
         end = warm_up + duration
-        how = {"through": through, "around": not ramp, "sublane": sublane, "parked": parked}
-        size = write_demand(network, demand_rng, folder, end, **how, straight=straight)
-        traffic = simulate_traffic(file, network, size, drive_rng, end, warm_up, sublane=sublane)
+        how = {"through": through, "around": not ramp, "sublane": sublane, "street": street}
+        demand = write_demand(network, demand_rng, folder, end, **how, straight=straight)
+        traffic = simulate_traffic(file, network, demand, drive_rng, end, warm_up, sublane=sublane)
     found, reasons = cut_segments(f"sumo-{kind_name(kind)}-{seed:06d}", network, traffic, cut_rng, rule)
     return [segment.replace(file=Path(kind).name) if own else segment for segment in found], reasons

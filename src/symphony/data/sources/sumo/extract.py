@@ -102,6 +102,7 @@ def _at_steps(traffic: Traffic) -> tuple[Traffic, Bools]:
         wild[:, EVERY:] |= np.linalg.norm(acceleration, axis=-1) > MAX_ACCELERATION
         wild[:, EVERY:] |= np.abs(yaw_rate) > MAX_YAW_RATE
     picked = {name: getattr(traffic, name)[:, ::EVERY] for name in ("position", "heading", "velocity", "present")}
+    wild[traffic.agent_type == AgentType.PEDESTRIAN] = False  # they turn on the spot
     lights = {light: states[:, ::EVERY] for light, states in traffic.lights.items()}
     return replace(traffic, lights=lights, **picked), wild[:, ::EVERY]
 
@@ -120,20 +121,25 @@ def _cut(
     if not stays[agents].any():
         return "no vehicle stays near the focus"
     position, valid, stays, size = position[agents], valid[agents], stays[agents], tracks.size[agents]
+    agent_type = tracks.agent_type[agents]
+    walks = agent_type == AgentType.PEDESTRIAN
     heading, velocity = tracks.heading[agents, window], tracks.velocity[agents, window]
     rows, seen = np.arange(len(agents)), valid.argmax(1)
-    # The farthest each vehicle gets from where it is first seen.
+    # The farthest each gets from where it is first seen.
     travel = np.where(valid, np.linalg.norm(position - position[rows, seen, None], axis=-1), 0).max(1)
-    weight = _interest(position, heading, velocity, valid, travel, rule) * (stays & (travel > _EGO_TRAVEL))
+    drives = (agent_type == AgentType.VEHICLE) & (travel > MOVING)
+    weight = _interest(position, heading, velocity, valid, drives, rule) * (stays & drives & (travel > _EGO_TRAVEL))
     if weight.sum() == 0:
         return "no moving ego with a moving partner"
-    if (valid[:, 0] & (travel > MOVING)).sum() < rule.interactive:
+    if (valid[:, 0] & drives).sum() < rule.interactive:
         return "too few moving vehicles at the first step"
     wild = bool((unphysical[agents, window] & valid).any())
-    if wild or _overlap(position, heading, size, valid):
+    if wild or _overlap(position, heading, size, valid, walks):
         return "unphysical motion" if wild else "overlap"
-    if not shapely.contains_xy(crop.drivable, *position[valid & (travel > _STANDS)[:, None]].T).all():
-        return "off the road"
+    drove = position[valid & (~walks & (travel > _STANDS))[:, None]]
+    off = not shapely.contains_xy(crop.drivable, *drove.T).all()
+    if off or shapely.contains_xy(crop.unwalked, *position[valid & walks[:, None]].T).any():
+        return "off the road" if off else "people on the road"
     ego = int(rng.choice(len(agents), p=weight / weight.sum()))
     lights = [tracks.lights[light][link, window] for light, link in crop.signals]
     # Unwrapped since the vehicle appeared; whole turns before the window mean nothing here.
@@ -145,7 +151,7 @@ def _cut(
             dt=DT,
             ego=ego,
             agent_id=agents.astype(np.int64),
-            agent_type=np.full(len(agents), AgentType.VEHICLE, np.uint8),
+            agent_type=agent_type,
             size=size,
             **motion(position, heading - 2 * np.pi * turns[:, None], velocity, valid),
             road=crop.road,
@@ -158,14 +164,16 @@ def _cut(
 
 
 def _interest(
-    position: Doubles, heading: Doubles, velocity: Doubles, valid: Bools, travel: Doubles, rule: CropRule
+    position: Doubles, heading: Doubles, velocity: Doubles, valid: Bools, drives: Bools, rule: CropRule
 ) -> Doubles:
-    """Return [A] chance of being the ego, 0 without partner: turning, closeness and changes of speed count."""
+    """Return [A] chance of being the ego, 0 without another that drives near by: turns, closeness and changes of
+    speed count.
+    """
     distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
     distance = np.where(valid[:, None] & valid[None], distance, np.inf)
     distance[np.arange(len(position)), np.arange(len(position))] = np.inf
     whole: Bools = np.all(valid, axis=1)
-    partner = np.flatnonzero(whole & (travel > MOVING))
+    partner = np.flatnonzero(whole & drives)
     has_partner = np.any(distance[:, partner, 0] < rule.partner_distance, axis=1)
     speed = np.where(whole[:, None], np.linalg.norm(velocity, axis=-1), 0)
     turns = np.where(whole, np.abs(heading[:, -1] - heading[:, 0]), 0) > _TURN
@@ -174,9 +182,10 @@ def _interest(
     return has_partner * (0.3 + rule.turn_interest * turns + 0.5 * near + 0.5 * changes)
 
 
-def _overlap(position: Doubles, heading: Doubles, size: Floats, valid: Bools) -> bool:
-    """Return whether the boxes of two vehicles ever share more than :data:`MAX_OVERLAP` metres."""
+def _overlap(position: Doubles, heading: Doubles, size: Floats, valid: Bools, walks: Bools) -> bool:
+    """Return whether two boxes, not both of people who walk, ever share more than :data:`MAX_OVERLAP` metres."""
     first, second = np.triu_indices(len(position), 1)
+    first, second = first[~(walks[first] & walks[second])], second[~(walks[first] & walks[second])]
     sides = size[:, :2].astype(np.float64)
     reach = np.linalg.norm(sides / 2, axis=-1)
     gap = np.linalg.norm(position[first] - position[second], axis=-1)

@@ -10,6 +10,7 @@ import shutil
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,13 @@ LATERAL_ACCELERATION = 3.0
 BEND = 2.0  # metres between the points of a lane at which it may bend
 RAMP_RADIUS = 190.0
 """Radius in metres of the largest map that fits between the ends of a freeway and of its ramps."""
+SIDEWALKS = (
+    " --sidewalks.guess true --sidewalks.guess.min-speed 0 --sidewalks.guess.max-speed 20"
+    " --crossings.guess true --crossings.guess.speed-threshold 20"
+)
+"""Options of networks where people walk: sidewalks beside all streets, crosswalks at all junctions."""
+VERGE = 1.9  # metres between the lanes and the sidewalk, where cars are parked
+KERB = 2  # SUMO's number of the lane at the kerb, after sidewalk and verge
 OWN_ROADS = {".xodr": "--opendrive-files", ".osm": "--osm-files", ".net.xml": "--sumo-net-file"}
 """Suffixes of users' own road networks (OpenDRIVE, OpenStreetMap, SUMO), and ``netconvert``'s options for them."""
 
@@ -46,6 +54,7 @@ class PlainNetwork:
     nodes: list[str] = field(default_factory=list)
     edges: list[str] = field(default_factory=list)
     connections: list[str] = field(default_factory=list)
+    walked: bool = False  # with sidewalks, beyond a :data:`VERGE` that is lane 0 until netconvert puts them there
 
     def node(self, name: str, point: Doubles, control: str, radius: float | None = None) -> None:
         """Add a junction."""
@@ -58,8 +67,9 @@ class PlainNetwork:
         points = " ".join(f"{x:.2f},{y:.2f}" for x, y in line)
         lanes, speed, width = road
         self.edges.append(
-            f'<edge id="{name}" from="{ends[0]}" to="{ends[1]}" numLanes="{lanes}" speed="{speed:.2f}" '
-            f'width="{width:.2f}" priority="{rank}" spreadType="{spread}" shape="{points}"/>'
+            f'<edge id="{name}" from="{ends[0]}" to="{ends[1]}" numLanes="{lanes + self.walked}" speed="{speed:.2f}" '
+            f'width="{width:.2f}" priority="{rank}" spreadType="{spread}" shape="{points}"'
+            + (f'><lane index="0" disallow="all" width="{VERGE}"/></edge>' if self.walked else "/>")
         )
         return name
 
@@ -70,7 +80,7 @@ class PlainNetwork:
 
     def compile(self, folder: Path, options: str) -> Path:
         """Write the XML, run ``netconvert`` and return the network file."""
-        arguments = f"--output-file net.net.xml {COMMON} {options}"
+        arguments = f"--output-file net.net.xml {COMMON} {options}{SIDEWALKS * self.walked}"
         for kind, lines in (("node", self.nodes), ("edge", self.edges), ("connection", self.connections)):
             if lines:
                 text = "\n".join([f"<{kind}s>", *lines, f"</{kind}s>"])
@@ -171,8 +181,10 @@ def _rotation(angle: float) -> Doubles:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def town(rng: Random, folder: Path) -> Path:
-    """Make a jittered and rotated grid of curved streets with T-junctions, mixed control and roundabouts."""
+def town(rng: Random, folder: Path, *, walked: bool = False) -> Path:
+    """Make a jittered and rotated grid of curved streets with T-junctions, mixed control and roundabouts; if
+    ``walked`` with verges, sidewalks and crosswalks.
+    """
     columns, rows = int(rng.integers(3, 6)), int(rng.integers(3, 5))
     step = rng.uniform(75, 115, 2)
     gx, gy = np.meshgrid(np.arange(columns), np.arange(rows))
@@ -190,7 +202,7 @@ def town(rng: Random, folder: Path) -> Path:
         main = a // columns in main_rows if a // columns == b // columns else a % columns in main_columns
         lanes, speed = arterial if main else collector
         links.append(_Link(a, b, line, main, lanes, min(speed, _comfortable_speed(line))))
-    net = PlainNetwork()
+    net = PlainNetwork(walked=walked)
     rings = _add_nodes(net, rng, nodes, links)
     for link in links:
         line, start, end = link.line, f"n{link.a}", f"n{link.b}"
@@ -422,5 +434,10 @@ def slow_bends(file: Path) -> None:
     tree.write(file)
 
 
-NETWORKS: dict[str, Callable[[Random, Path], Path]] = {"town": town, "grid": grid, "ramp": freeway, "street": town}
+NETWORKS: dict[str, Callable[[Random, Path], Path]] = {
+    "town": town,
+    "grid": grid,
+    "ramp": freeway,
+    "street": partial(town, walked=True),
+}
 """Kinds of network; each function writes files into a folder and returns the path of the network."""

@@ -25,7 +25,7 @@ _FREEWAY_SPEED = 22.0
 _APPROACH = 15.0
 _LANE_SPACING, _CONNECTOR_SPACING, _BOUNDARY_SPACING = 2.0, 1.5, 3.0
 _BOUNDARY_TOLERANCE = 0.04
-_SLIT = 0.3
+_SLIT, _SLIVER = 0.3, 1.0
 BOUNDARY_MARGIN = 25.0
 """Metres by which the road boundary reaches beyond the lanes that are cut: connectors may reach beyond."""
 
@@ -45,7 +45,9 @@ class Network:
     connectors: dict[str, list[tuple[int, int, int]]]  # per light (link, connector it controls, lane before)
     stop_lanes: list[int]  # the lane at the kerb of each edge that ends at a stop sign
     side: int  # of the kerb: 1 right, -1 left
-    junction_shapes: list[Doubles]  # the paved area of each junction
+    junction_shapes: list[Doubles]  # the paved area of each junction, with its corners where people walk
+    walked: list[Doubles]  # the areas at junctions where people walk, but for crosswalks
+    crosswalks: list[Doubles]  # the four corners [4, 2] of each
     centers: Doubles  # [J, 2] junctions where at least three streets meet or lanes split or join, or middles of roads
 
     def sources(self) -> list[int]:
@@ -106,12 +108,18 @@ def read_network(file: Path) -> Network:
     width, speed, internal, edge, names = [], [], [], [], []
     index: dict[str, int] = {}
     beside: tuple[list[tuple[int, int]], ...] = [], []
-    balance: Counter[str] = Counter()
+    balance, crossed = Counter[str](), Counter[str]()
+    walked, crosswalks = list[Doubles](), list[Doubles]()
     for element in root.iter("edge"):
         if element.get("function") is None:
             balance.update({element.attrib["from"]: -1})
             balance.update({element.attrib["to"]: 1})
         names.append(element.attrib["id"])
+        if element.get("function") == "walkingarea":
+            walked += [shape(lane.attrib["shape"]) for lane in element.iter("lane")]
+        if element.get("function") == "crossing":
+            crosswalks += [_across(shape(lane.attrib["shape"]), lane) for lane in element.iter("lane")]
+            crossed[element.attrib["id"][1:].rpartition("_")[0]] += 1
         # From right to left, which is the other way round where people drive on the left.
         own = list(filter(for_cars, element.iter("lane")))[::side]
         for lane in own:
@@ -127,7 +135,7 @@ def read_network(file: Path) -> Network:
             near = abs(int(one.attrib["index"]) - int(other.attrib["index"])) == 1
             beside[0].extend([way] * (near and _has_cars(one.get("changeLeft", "all"))))
             beside[1].extend([way[::-1]] * (near and _has_cars(other.get("changeRight", "all"))))
-    successors, stops, shapes, centers = set(), set(), [], []
+    successors, stops = set(), set()
     connectors: dict[str, list[tuple[int, int, int]]] = {}
     for link in root.iter("connection"):
         start, end = (index.get(f"{link.attrib[which]}_{link.attrib[f'{which}Lane']}") for which in ("from", "to"))
@@ -139,15 +147,7 @@ def read_network(file: Path) -> Network:
             connectors.setdefault(link.attrib["tl"], []).append((int(link.attrib["linkIndex"]), via, start))
         if link.get("state") in {"s", "w"}:
             stops.add([k for k, own in enumerate(edge) if own == edge[start]][::side][0])
-    for junction in root.iter("junction"):
-        outline = shape(junction.get("shape", ""))
-        if junction.get("type") == "internal" or len(outline) < 3:
-            continue
-        shapes.append(outline)
-        # Where streams of traffic cross, split or join. Sources and sinks are out of balance, but have no shape.
-        crossing = any("1" in request.attrib["foes"] for request in junction.iter("request"))
-        if crossing or balance[junction.attrib["id"]] != 0:
-            centers.append(outline.mean(0))
+    shapes, centers = _junctions(root, balance, crossed)
     # Roads without a junction are seen from their middles.
     middles = (densify(line, _LANE_SPACING) for line, inner in zip(lanes, internal, strict=True) if not inner)
     centers = centers or [line[len(line) // 2] for line in middles]
@@ -164,8 +164,31 @@ def read_network(file: Path) -> Network:
         sorted(stops),
         side,
         shapes,
+        walked,
+        crosswalks,
         np.array(centers).reshape(-1, 2),
     )
+
+
+def _junctions(
+    root: ET.Element, balance: Counter[str], crossed: Counter[str]
+) -> tuple[list[Doubles], list[NDArray[Any]]]:
+    """Return the outlines of junctions, and where streams of traffic meet at them: ``balance`` counts the streets
+    that enter a junction less those that leave it, ``crossed`` its crosswalks.
+    """
+    shapes, centers = list[Doubles](), list[NDArray[Any]]()
+    for junction in root.iter("junction"):
+        outline = shape(junction.get("shape", ""))
+        if junction.get("type") == "internal" or len(outline) < 3:
+            continue
+        shapes.append(outline)
+        # Where streams of traffic cross, split or join. Sources and sinks are out of balance, but have no shape.
+        foes = [request.attrib["foes"] for request in junction.iter("request")]
+        cars = len(foes) - crossed[junction.attrib["id"]]  # crosswalks come last, and first in the names of foes
+        crossing = any("1" in those[-cars:] for those in foes[:cars])
+        if crossing or balance[junction.attrib["id"]] != 0:
+            centers.append(outline.mean(0))
+    return shapes, centers
 
 
 @dataclass(frozen=True)
@@ -178,6 +201,14 @@ class Crop:
     signal_lane: NDArray[np.int32]  # [Q] the connector it controls
     signal_point: Floats  # [Q, 3] the stop point: end of the lane that leads to the connector
     drivable: Polygon | MultiPolygon  # in the map's frame
+    unwalked: Polygon | MultiPolygon  # the road, but for crosswalks and its edge
+
+
+def _across(line: Doubles, lane: ET.Element) -> Doubles:
+    """Return the corners [4, 2] of a crosswalk."""
+    along = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
+    aside = np.array([-along[1], along[0]]) * float(lane.attrib["width"]) / 2
+    return np.stack([line[0] + aside, line[0] - aside, line[-1] - aside, line[-1] + aside])
 
 
 def crop_network(network: Network, center: Doubles, radius: float) -> Crop:
@@ -207,7 +238,8 @@ def crop_network(network: Network, center: Doubles, radius: float) -> Crop:
     pairs = pairs[np.array(whole_end)[pairs[:, 0]] & np.array(whole_start)[pairs[:, 1]]]
     drivable = _drivable(network, center, radius + BOUNDARY_MARGIN)
     ends = {k: lines[i][-1] for i, k in enumerate(kept) if whole_end[i]}
-    marks = [_beside(lines[place[k]], network.width[k], network.side) for k in network.stop_lanes if k in ends]
+    signs = [_beside(lines[place[k]], network.width[k], network.side) for k in network.stop_lanes if k in ends]
+    walks = [ring - center for ring in network.crosswalks if np.linalg.norm(ring.mean(0) - center) <= radius]
     kinds = np.where(network.speed[kept] > _FREEWAY_SPEED, LaneType.FREEWAY, LaneType.SURFACE_STREET)
     road = RoadMap(
         lanes=Polylines.of(lines),
@@ -219,8 +251,8 @@ def crop_network(network: Network, center: Doubles, radius: float) -> Crop:
         left_neighbors=left,
         right_neighbors=right,
         boundary=Polylines.of(_boundary(drivable, radius + BOUNDARY_MARGIN)),
-        marks=Polylines.of(marks),
-        mark_type=np.full(len(marks), MarkType.STOP_SIGN, np.uint8),
+        marks=Polylines.of(signs + walks),
+        mark_type=np.array([MarkType.STOP_SIGN] * len(signs) + [MarkType.CROSSWALK] * len(walks), np.uint8),
     )
     controlled = [
         ((light, number), place[via], network.lanes[start][-1] - center)
@@ -235,6 +267,9 @@ def crop_network(network: Network, center: Doubles, radius: float) -> Crop:
         np.array([lane for _, lane, _ in controlled], np.int32),
         np.array([[*point, 0] for *_, point in controlled], np.float32).reshape(-1, 3),
         drivable,
+        drivable.buffer(-_SLIVER / 2).difference(
+            shapely.union_all([Polygon(ring) for ring in walks]).buffer(_SLIVER)
+        ),
     )
 
 
@@ -264,6 +299,12 @@ def _drivable(network: Network, center: Doubles, radius: float) -> Polygon | Mul
     strips = shapely.buffer(lines[near], network.width[near] / 2, **flat)
     shapes = np.array([Polygon(s - center) for s in network.junction_shapes], dtype=object)
     shapes = shapely.make_valid(shapes[shapely.intersects(shapes, circle)])
+    if network.walked:
+        corners = [shapely.make_valid(Polygon(area - center)) for area in network.walked]
+        paved = shapely.get_parts(shapely.difference(shapes, shapely.union_all(corners)))
+        # At sharp bends people walk inside the outline, of which what lies beyond them is no road.
+        driven = shapely.intersects(paved, shapely.union_all(lines[near]))
+        shapes = shapely.buffer(shapely.buffer(paved[driven], -_SLIVER), _SLIVER, join_style="mitre")
     union = shapely.union_all(np.concatenate([strips, shapes]))
     return union.buffer(_SLIT, join_style="mitre").buffer(-_SLIT, join_style="mitre")
 

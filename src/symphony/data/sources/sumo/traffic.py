@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.segment import Bools, Floats, SignalState
+from symphony.data.segment import AgentType, Bools, Floats, SignalState
 from symphony.data.sources.base import Doubles
+from symphony.data.sources.sumo.networks import KERB
 from symphony.data.sources.sumo.process import run_program
 from symphony.data.sources.sumo.roads import Network
 from symphony.errors import DataError
@@ -23,6 +24,14 @@ _BODIES = (
     (0.07, (7.0, 9.5), (2.2, 2.45), (2.8, 3.6), "truck"),
     (0.03, (10.5, 12.0), (2.45, 2.55), (3.0, 3.4), "bus"),
 )
+# (Least, most) length, width and height in metres and speed in m/s, class and settings of those who cycle and walk.
+_CYCLE = (
+    *((1.6, 1.85), (0.55, 0.7), (1.6, 1.85), (3.5, 6.5), "bicycle"),
+    'minGap="1.0" latAlignment="right" maxSpeedLat="0.6"',
+)
+_WALKER = (0.35, 0.5), (0.45, 0.6), (1.5, 1.9), (1.0, 1.7), "pedestrian", ""
+_CYCLES, _CYCLING = 4, 0.15  # types of the first, and their share of those on the road
+_WALKERS, _WALKING = 4, (8, 24)  # types of the second, and how many walk for each kilometre of sidewalk
 _LONGEST_PARKED, _WIDEST_PASSING = 6.0, 2.0  # metres
 _GAP, _AHEAD = 0.6, 3.2  # metres that vehicles keep beside them and, at most, ahead; SUMO puts nobody nearer
 _DRIVERS = ("IDM", "EIDM", "Krauss")
@@ -48,8 +57,10 @@ _STATES = {
 """SUMO's letters for the state of a light."""
 
 
-def _types(rng: np.random.Generator, sublane: bool) -> tuple[list[str], Floats, Doubles]:
-    """Return XML, boxes [TYPES, 3] and shares [TYPES] of the vehicle types."""
+def _types(rng: np.random.Generator, sublane: bool, street: bool) -> tuple[list[str], Floats, Doubles]:
+    """Return XML, boxes [K, 3] and shares [K] of :data:`TYPES` of vehicles; in streets also of those who cycle and,
+    with shares of 0, of those who walk.
+    """
     # At least one type per body, so that a run's mix has all of them.
     bodies = np.concatenate([np.arange(len(_BODIES)), rng.choice([0, 0, 0, 0, 1, 2], TYPES - len(_BODIES))])
     counts = np.bincount(bodies, minlength=len(_BODIES))
@@ -68,6 +79,18 @@ def _types(rng: np.random.Generator, sublane: bool) -> tuple[list[str], Floats, 
         )
         sizes.append(np.round(size, 2))
         shares.append(share / counts[body])
+    if street:
+        # Wider ones would stand behind a parked car for ever, as nobody uses the lane of oncoming traffic.
+        shares = [share * (size[1] < _WIDEST_PASSING) for share, size in zip(shares, sizes, strict=True)]
+        shares += [np.sum(shares) * _CYCLING / (1 - _CYCLING) / _CYCLES] * _CYCLES + [0.0] * _WALKERS
+        for k in range(TYPES, TYPES + _CYCLES + _WALKERS):
+            *ranges, speeds, name, extra = _CYCLE if k < TYPES + _CYCLES else _WALKER
+            size, speed = [rng.uniform(*each) for each in ranges], rng.uniform(*speeds)
+            lines.append(
+                f'<vType id="t{k}" vClass="{name}" length="{size[0]:.2f}" width="{size[1]:.2f}" '
+                f'height="{size[2]:.2f}" maxSpeed="{speed:.2f}" {extra}/>'
+            )
+            sizes.append(np.round(size, 2))
     return lines, np.asarray(sizes, np.float32), np.asarray(shares) / np.sum(shares)
 
 
@@ -80,19 +103,17 @@ def write_demand(
     through: bool,
     around: bool,
     sublane: bool,
-    parked: bool = False,
+    street: bool = False,
     straight: float = 1.0,
-) -> Floats:
+) -> tuple[Floats, NDArray[np.uint8]]:
     """Write vehicle types and vehicles, with routes that last ``duration`` seconds, into the file :data:`ROUTES`.
 
     If ``through``, traffic enters at the sources of the network during the whole run and leaves it at the end; if
-    ``around``, a fixed number of vehicles starts everywhere; if ``parked``, others stand at the kerb. A route is a
-    random walk, at junctions ``straight`` times as likely to go straight on as to take any one turn. Returns the box
-    [3] of each vehicle k (its id in SUMO).
+    ``around``, a fixed number of vehicles starts everywhere; in a ``street`` some of them cycle, others stand at the
+    kerb, and people walk. A route is a random walk, at junctions ``straight`` times as likely to go straight on as to
+    take any one turn. Returns the box [3] and the :class:`AgentType` of each vehicle or person k (its id in SUMO).
     """
-    types, sizes, shares = _types(rng, sublane)
-    if parked:  # wider ones would stand behind a parked car for ever, as nobody uses the lane of oncoming traffic
-        shares = np.where(sizes[:, 1] < _WIDEST_PASSING, shares, 0.0) / shares[sizes[:, 1] < _WIDEST_PASSING].sum()
+    types, sizes, shares = _types(rng, sublane, street)
     following, length, lanes = network.edge_graph()
     speed = float(network.speed.max())
     chance: list[Doubles] = []
@@ -118,9 +139,12 @@ def write_demand(
         starts += rng.choice(len(length), count, p=weight / weight.sum()).tolist()
         places += ['departPos="random_free" departLane="best" departSpeed="speedLimit"'] * count
     order = np.argsort(departs, kind="stable")
-    kinds = rng.choice(TYPES, len(order), p=shares)
-    standing, stood = _parked(network, rng, sizes, len(order)) if parked else ([], kinds[:0])
-    lines = ["<routes>", *types, *standing]
+    kinds = rng.choice(len(types), len(order), p=shares)
+    lines = ["<routes>", *types]
+    if street:
+        for more in (_parked, _walking):
+            found, those = more(network, rng, sizes, len(kinds))
+            lines, kinds = lines + found, np.concatenate([kinds, those])
     for k, i in enumerate(order):
         at = starts[i]
         route, total = [at], float(length[at])
@@ -134,34 +158,56 @@ def write_demand(
             f'<route edges="{edges}"/></vehicle>'
         )
     (folder / ROUTES).write_text("\n".join([*lines, "</routes>"]))
-    return sizes[np.concatenate([kinds, stood])]
+    agent_type = np.select(
+        [kinds < TYPES, kinds < TYPES + _CYCLES], [AgentType.VEHICLE, AgentType.CYCLIST], AgentType.PEDESTRIAN
+    )
+    return sizes[kinds], agent_type.astype(np.uint8)
 
 
 def _parked(network: Network, rng: np.random.Generator, sizes: Floats, first: int) -> tuple[list[str], NDArray[Any]]:
     """Return vehicles, numbered from ``first``, that stand partly on the lanes of most streets, and their types."""
-    lines, kinds, small = list[str](), list[int](), np.flatnonzero(sizes[:, 0] < _LONGEST_PARKED)
+    lines, kinds, small = list[str](), list[int](), np.flatnonzero(sizes[:TYPES, 0] < _LONGEST_PARKED)
     length = network.edge_graph()[1]
     for edge in np.flatnonzero(length):
-        # Of the lanes of an edge the first is at the kerb, which in networks of our own is on the right.
+        # Of the lanes of an edge for cars the first is at the kerb, which in networks of our own is on the right.
         kerb, lane = network.width[np.argmax(network.edge == edge)] / 2, network.edge_names[edge]
         places = np.arange(12.0 + rng.uniform(0, 10), length[edge] - 15, _LONGEST_PARKED + _AHEAD)
         for at in places[rng.random(len(places)) < rng.uniform(-0.3, 0.8)]:
             kind = int(rng.choice(small))
             aside = kerb + sizes[kind, 1] / 2 - rng.uniform(0.1, min(0.8, 2 * kerb - _WIDEST_PASSING - _GAP))
             lines.append(
-                f'<vehicle id="{first + len(kinds)}" type="t{kind}" depart="0" departPos="stop" departLane="0">'
-                f'<route edges="{lane}"/><stop lane="{lane}_0" startPos="{at:.2f}" posLat="{-aside:.2f}" '
+                f'<vehicle id="{first + len(kinds)}" type="t{kind}" depart="0" departPos="stop" departLane="{KERB}">'
+                f'<route edges="{lane}"/><stop lane="{lane}_{KERB}" startPos="{at:.2f}" posLat="{-aside:.2f}" '
                 f'endPos="{at + sizes[kind, 0]:.2f}" duration="100000"/></vehicle>'
             )
             kinds.append(kind)
     return lines, np.asarray(kinds, np.int64)
 
 
+def _walking(
+    network: Network, rng: np.random.Generator, sizes: Floats, first: int
+) -> tuple[list[str], NDArray[np.int64]]:
+    """Return people, numbered from ``first``, who walk from one street to another and a third, and their types."""
+    length = network.edge_graph()[1]
+    streets = np.flatnonzero(length)
+    count = round(float(length.sum()) / 1000 * rng.uniform(*_WALKING))
+    kinds = rng.integers(len(sizes) - _WALKERS, len(sizes), count)
+    lines = []
+    for k, kind in enumerate(kinds):
+        start, *ends = rng.choice(streets, 3)
+        at = rng.uniform(0, length[start])
+        walks = "".join(f'<walk to="{network.edge_names[end]}"/>' for end in ends)
+        begin = f'<person id="{first + k}" type="t{kind}" depart="0" departPos="{at:.2f}">'
+        lines.append(begin + walks.replace("<walk", f'<walk from="{network.edge_names[start]}"', 1) + "</person>")
+    return lines, kinds
+
+
 @dataclass(frozen=True)
 class Traffic:
-    """Tracks of all V vehicles and all lights at N times, in the network's frame; NaN where a vehicle is absent."""
+    """Tracks of all V vehicles and people, and lights, at N times in the network's frame; NaN where one is absent."""
 
     size: Floats  # [V, 3] boxes
+    agent_type: NDArray[np.uint8]  # [V] of :class:`AgentType`
     position: Doubles  # [V, N, 2] box centres
     heading: Doubles  # [V, N] unwrapped along time
     velocity: Doubles  # [V, N, 2] m/s
@@ -172,7 +218,7 @@ class Traffic:
 def simulate_traffic(
     network_file: Path,
     network: Network,
-    size: Floats,
+    demand: tuple[Floats, NDArray[np.uint8]],
     rng: np.random.Generator,
     duration: float,
     warm_up: float,
@@ -182,7 +228,7 @@ def simulate_traffic(
     """Simulate what :func:`write_demand` wrote, record from ``warm_up`` to ``duration`` seconds and smooth. Vehicles
     keep a lateral offset of their own from the centre of the lane that drifts with the distance driven.
     """
-    folder = network_file.parent
+    folder, (size, agent_type) = network_file.parent, demand
     events = [
         f'<timedEvent type="SaveTLSSwitchStates" source="{light}" dest="lights{k}.xml"/>'
         for k, light in enumerate(network.connectors)
@@ -207,15 +253,16 @@ def simulate_traffic(
     lights = {
         light: _read_lights(folder / f"lights{k}.xml", time + REACTION) for k, light in enumerate(network.connectors)
     }
-    return Traffic(size, position, heading, velocity, present, lights)
+    return Traffic(size, agent_type, position, heading, velocity, present, lights)
 
 
 def _read_tracks(file: Path, time: Doubles, count: int) -> tuple[Doubles, Doubles]:
     """Return front bumper [V, N, 2] and heading [V, N], NaN where absent."""
     front, heading = np.full((count, len(time), 2), np.nan), np.full((count, len(time)), np.nan)
     with file.open() as lines:
-        header = lines.readline().strip().split(";")
-        names = ("timestep_time", "vehicle_id", "vehicle_x", "vehicle_y", "vehicle_angle")
+        # The first of a time step names the columns for all: "vehicle_x", or "person_x".
+        header = [name.partition("_")[2] for name in lines.readline().strip().split(";")]
+        names = ("time", "id", "x", "y", "angle")
         table = np.loadtxt(lines, delimiter=";", usecols=[header.index(name) for name in names], ndmin=2)
     if len(table) == 0:
         raise DataError("no vehicle drove in the recorded time", file=file.name)
