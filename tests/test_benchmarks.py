@@ -105,7 +105,7 @@ def test_being_hit_from_behind_costs_nothing(program: Any, monkeypatch: Any) -> 
     scenes = scene(make_segment(straight_road().road, place, heading, np.gradient(place, 0.2, axis=1)), [0, 2, 4, 5])
     scenes.last_step[:] = 10
     env = DrivingEnv(scenes, Bicycle(), ObservationConfig.nothing())
-    start, ahead = env.start(torch.tensor([0])), ConstantVelocity(env.dynamics, env.dt)
+    start, ahead = env.start(torch.tensor([0])), ConstantVelocity(Bicycle())
     driven = env.rollout(10, ahead, auto_reset=False, tensordict=start)
     after = driven["next"].select(keys.STEP, keys.VALID, keys.STATE)[:, -1:]
     replay = SearchReplay.__new__(SearchReplay)  # searches go on beyond the end, which counts for nothing

@@ -93,7 +93,6 @@ def test_the_evidence_is_that_of_kalmans_filter(threshold):
     assert (found.sample_size <= 128 + 1e-6).all()
     kept = (found.parents == torch.arange(128)).all(-1)[:, :-1]
     assert torch.equal(kept, found.sample_size[:, :-1] > threshold * 128) or threshold == 1.0
-    assert (found.descendants.sum(-1) == 128).all()
 
 
 def test_a_value_looks_ahead_without_a_bias():

@@ -218,15 +218,15 @@ def test_step_gradient_matches_finite_differences():
 
 
 def test_constant_velocity_keeps_its_speed_and_course():
+    env = make_env(straight_road(), dynamics=Bicycle())
+    policy, now = ConstantVelocity(Bicycle()), env.start(torch.tensor([0]))
+    for _ in range(50):
+        now = env.step(policy(now))["next"]
+    # On a straight road at constant speeds that is the log itself.
+    truth = torch.from_numpy(straight_road().position[:2, 50, :2])
+    torch.testing.assert_close(now[keys.STATE][0, :, :2], truth, atol=0.01, rtol=0)
+    # Who comes in reverse begins at rest: none of the actions reverses.
     for dynamics in (Bicycle(), Displacement()):
-        env = make_env(straight_road(), dynamics=dynamics)
-        policy, now = ConstantVelocity(dynamics, env.dt), env.start(torch.tensor([0]))
-        for _ in range(50):
-            now = env.step(policy(now))["next"]
-        # On a straight road at constant speeds that is the log itself.
-        truth = torch.from_numpy(straight_road().position[:2, 50, :2])
-        torch.testing.assert_close(now[keys.STATE][0, :, :2], truth, atol=0.01, rtol=0)
-        # Who comes in reverse begins at rest: none of the actions reverses.
         back = make_env(straight_road().replace(velocity=-straight_road().velocity), dynamics=dynamics)
         assert not back.start(torch.tensor([0]))[keys.STATE][..., 3].any()
 

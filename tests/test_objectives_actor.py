@@ -121,7 +121,7 @@ def test_it_keeps_the_contract_of_torchrl(kind, continuous):
         dirty[ROLLOUT] = td[ROLLOUT] ^ padded
 
     def make(**arguments):
-        return kind(actor(), use_mask=True, **arguments)
+        return kind(actor(), **arguments)
 
     check_contract(make, td, 2 if continuous else 4, dirty)
 
@@ -132,12 +132,9 @@ def test_a_mask_counts_where_there_is_one():
     everyone = bc(td, torch.ones_like(td[VALID]))
     assert not torch.isclose(everyone, masked)
     torch.testing.assert_close(bc(bare), everyone)
-    torch.testing.assert_close(bc(td, use_mask=False), everyone)
-    torch.testing.assert_close(bc(td, use_mask=True), masked)
-    assert VALID not in BCLoss(categorical_actor(), use_mask=False).in_keys
     # A network that reads the mask: what is without one can't be told from what is to be trained on.
-    reading = BCLoss(categorical_actor(observation=VALID), use_mask=None)
-    with pytest.raises(KeyError, match="use_mask=False"):
+    reading = BCLoss(categorical_actor(observation=VALID))
+    with pytest.raises(KeyError, match="no mask"):
         reading._mask(bare)
     reading.set_keys(valid="other")
     assert reading._mask(bare) is None
@@ -162,7 +159,7 @@ def test_an_action_of_another_shape_is_refused_where_it_would_be_broadcast(shape
     td = TensorDict(batch_size=[])
     td[OBSERVATION], td[ACTION] = torch.randn(6, 4), torch.zeros(shape, dtype=torch.int64)
     with pytest.raises(ValueError, match=r"action .* has shape"):
-        BCLoss(categorical_actor(), use_mask=False)(td)
+        BCLoss(categorical_actor())(td)
     td[ACTION] = torch.randn(6, 1)
     with pytest.raises(ValueError, match=r"has shape \(6, 1\), the actor's are \(6, 2\)"):
         BCLoss(gaussian_actor())(td)

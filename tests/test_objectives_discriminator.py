@@ -96,7 +96,7 @@ def test_it_keeps_the_contract_of_torchrl(arguments):
     dirty[OBSERVATION][padded] = 1e3
 
     def make(**more):
-        return DiscriminatorLoss(discriminator(), use_mask=True, **{**arguments, **more})
+        return DiscriminatorLoss(discriminator(), **{**arguments, **more})
 
     check_contract(make, td, 4, dirty)
 

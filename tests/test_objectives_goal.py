@@ -124,7 +124,7 @@ def test_it_keeps_the_contract_of_torchrl():
     dirty[ROUTES] = torch.cat([dirty[ROUTES], dirty[ROUTES][..., :2, :]], -2)
 
     def make(**arguments):
-        return GoalLoss(goal_network(), use_mask=True, **arguments)
+        return GoalLoss(goal_network(), **arguments)
 
     check_contract(make, td, 3, dirty)
 

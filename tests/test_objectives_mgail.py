@@ -247,7 +247,7 @@ def walkers(agents, **arguments):
 def test_it_keeps_the_contract_of_torchrl(agents, arguments):
     td = starts(Walk(agents), 5, branches=1)[:, 0]
     td[VALID] = torch.ones(5, agents, dtype=torch.bool)
-    check_contract(lambda **more: walkers(agents, use_mask=True, **{**arguments, **more}), td, 4)
+    check_contract(lambda **more: walkers(agents, **{**arguments, **more}), td, 4)
 
 
 def test_an_actor_with_memory_acts_as_in_a_rollout():
@@ -261,7 +261,7 @@ def test_an_actor_with_memory_acts_as_in_a_rollout():
     env = with_rows(PendulumEnv(seed=0), [4])
     env = env.append_transform(InitTracker()).append_transform(memory.make_tensordict_primer())
     start = env.reset()
-    loss = MGAILLoss(policy, column("score"), env, horizon=6, cost="logit", use_mask=False, reduction="none")
+    loss = MGAILLoss(policy, column("score"), env, horizon=6, cost="logit", reduction="none")
     loss.set_keys(score="score")
     driven = env.rollout(6, policy, auto_reset=False, tensordict=start.clone(), break_when_any_done=False)
     torch.testing.assert_close(loss(start)["loss_mgail"].squeeze(-1), driven["next", "thdot"])
@@ -322,7 +322,7 @@ def test_an_episode_ends_once(agents):
     values = []
     for sticky, until in ((True, True), (False, True), (False, False)):
         torch.manual_seed(0)
-        how = {"horizon": 12, "reduction": "none", "use_mask": False, "cost": "logit", "until_done": until}
+        how = {"horizon": 12, "reduction": "none", "cost": "logit", "until_done": until}
         loss = MGAILLoss(policy, far, Mass(agents=agents, sticky=sticky), **how)
         loss.set_keys(score=of("score")[0], done=of("done")[0])
         values.append(loss(start)["loss_mgail"].detach())

@@ -20,7 +20,7 @@ from helpers_store import fill
 from symphony import cli, keys
 from symphony.agents import load_agent
 from symphony.config.evaluation import EvaluateConfig, SimulateConfig
-from symphony.data.segment import AgentType, SignalState, content_hash, validate
+from symphony.data.segment import AMBER, GREEN, AgentType, SignalState, content_hash, validate
 from symphony.envs import DrivingEnv, scene
 from symphony.envs.observation import ObservationConfig
 from symphony.envs.scene import map_edge
@@ -31,7 +31,7 @@ from symphony.geometry import boxes_overlap
 from symphony.roadgraph import LaneGraph
 from symphony.rollouts.crowd import crowd_dataset
 from symphony.rollouts.driving import simulation
-from symphony.rollouts.lights import AMBER, GREEN, USUAL, _planned, continued, cycle
+from symphony.rollouts.lights import USUAL, _planned, continued, cycle
 from symphony.rollouts.onward import PRIOR, Onward, entrances, entry_rates
 from symphony.saved.folder import load_rollouts
 from symphony.saved.rollouts import world_of

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -106,11 +105,6 @@ def test_another_simulation_or_folder_is_refused(tmp_path):
     save_all(tmp_path / "sim", ABOUT, [played(straight_road())])
     with pytest.raises(DataError, match=r"another simulation, which differs in settings\.rollouts"):
         RolloutWriter(tmp_path / "sim", dataclasses.replace(ABOUT, settings={"rollouts": 3}))
-    # What an older folder says nothing of was as it is by default now.
-    for lights in ([], [20.0, 3.0, 2.0]):
-        more = dataclasses.replace(ABOUT, settings={**ABOUT.settings, "lights": lights, "after_collision": "go-on"})
-        with pytest.raises(DataError, match=r"settings\.lights$") if lights else contextlib.nullcontext():
-            RolloutWriter(tmp_path / "sim", more).close()
     with patch("symphony.saved.folder.write_json", side_effect=OSError("full")), pytest.raises(OSError, match="full"):
         RolloutWriter(tmp_path / "full", ABOUT)
     RolloutWriter(tmp_path / "full", ABOUT).close()

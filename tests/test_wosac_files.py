@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import os
 import tarfile
 import tempfile
 import zlib
@@ -23,6 +24,7 @@ from symphony.cli import main
 from symphony.config import WosacSettings
 from symphony.errors import DataError, SymphonyError
 from symphony.wosac import check_submission, write_submission
+from symphony.wosac import submission as submissions
 from symphony.wosac import wosac_pb2 as pb
 from symphony.wosac.files import read_rollouts, score_files
 from symphony.wosac.records import logged_scenario, read_scenarios, simulated_ids
@@ -311,6 +313,20 @@ def test_what_is_written_can_be_read_and_is_all_well(submission, tmp_path):
     write_submission(ROLLOUTS.items(), META, tmp_path / "again.tar.gz", shards=2)
     assert (tmp_path / "again.tar.gz").read_bytes() == submission[0].read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == ["again.tar.gz"]
+
+
+def test_drafts_of_killed_processes_go_and_full_disks_are_told(tmp_path, monkeypatch):
+    dead, lives = (tmp_path / f".x.tar.gz.{process}.abcd_1234" for process in (2**40, os.getppid()))
+    dead.mkdir(), lives.mkdir()
+    write_submission(ROLLOUTS.items(), META, out := tmp_path / "x.tar.gz", shards=1)
+    assert {*tmp_path.iterdir()} == {lives, out}
+    monkeypatch.setattr(submissions, "_pack", lambda *_: os.stat("/nowhere"))
+    with pytest.raises(DataError, match=r"x\.tar\.gz: can't be written"):
+        write_submission(ROLLOUTS.items(), META, out, shards=1)
+    with pytest.raises(DataError, match="scenario_id: missing"):
+        write_submission([("", next(iter(ROLLOUTS.values())))], META, out, shards=1)
+    with pytest.raises(SymphonyError, match="config must be one of"):
+        score_files(tmp_path, tmp_path, config="2023")
 
 
 def test_field_numbers_of_the_public_format():

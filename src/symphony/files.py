@@ -42,7 +42,7 @@ def replacing(path: Path) -> Iterator[Path]:
         # Drafts of this file by processes that were killed go.
         pattern = re.compile(rf"\.{re.escape(place.stem)}\.(\d+)\.new{re.escape(place.suffix)}")
         for found in filter(None, map(pattern.fullmatch, os.listdir(place.parent))):
-            if not _lives(int(found[1])):
+            if not lives(int(found[1])):
                 (place.parent / found[0]).unlink(missing_ok=True)
         draft = place.with_name(f".{place.stem}.{os.getpid()}.new{place.suffix}")
         try:
@@ -62,7 +62,8 @@ def _place(path: Path) -> Path:
     return place
 
 
-def _lives(process: int) -> bool:
+def lives(process: int) -> bool:
+    """Return whether a process of this machine runs."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError, PermissionError) as error:
@@ -74,6 +75,19 @@ def write_file(path: Path, text: str) -> None:
     """Write a text file, as :func:`replacing` does; what UTF-8 can't hold, as of odd paths, is escaped."""
     with replacing(path) as draft:
         draft.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Parse a JSON object; a :class:`DataError` if it can't be read, or is not one."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"can't be read: {error.strerror or error}", file=path) from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"not valid JSON ({error})", file=path) from error
+    if not isinstance(found, dict):
+        raise DataError("not a JSON object", file=path)
+    return found
 
 
 def write_json(path: Path, result: Any) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from symphony.errors import ConfigError, DataError
+from symphony.files import read_object
 
 PREFIX = "pretrained:"  # names of agents that come with the package begin with it
 FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
@@ -108,7 +108,6 @@ def read_card(folder: Path) -> dict[str, Any]:
     ``scores`` (one for each data set it was evaluated on) and ``limits``.
     """
     file = folder / CARD
-    try:
-        return json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DataError("the agent has no model card", file=file) from error
+    if not file.exists():
+        raise DataError("the agent has no model card", file=file)
+    return read_object(file)

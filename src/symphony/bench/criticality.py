@@ -139,7 +139,7 @@ def hardest(
     source: SegmentStore | RolloutFolder,
     count: int,
     items: Sequence[int] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda *_: None,
 ) -> list[tuple[int, Criticality]]:
     """Return the ``count`` most critical run segments of a store (or of its rows ``items``), or rollouts of a folder,
     the hardest first; equal ones in their order. ``progress`` is called with the number looked at and the total.
@@ -149,6 +149,5 @@ def hardest(
         one = source[row]
         runs = range(one.rollouts) if isinstance(one, SavedRollouts) else [None]
         found += [(row, criticality(one, k)) for k in runs]
-        if progress is not None:
-            progress(number + 1, len(rows))
+        progress(number + 1, len(rows))
     return sorted(found, key=lambda one: -one[1].score)[:count]

@@ -138,7 +138,7 @@ def _rate(kept: SavedRollouts, estimates: NDArray[np.float64], why: str) -> Rate
     return Rate(kept.segment.segment_id, float(estimates.mean()), error, trees, kept.rollouts, why)
 
 
-def hunt(path: Path, hunter: Hunt, progress: Callable[[int, int], None] | None = None) -> list[Rate]:
+def hunt(path: Path, hunter: Hunt, progress: Callable[[int, int], None] = lambda *_: None) -> list[Rate]:
     """Return the rates in all segments and, last, their mean; a few runs of each that show the event are kept in a
     folder, where the same hunt finds them again.
 
@@ -178,8 +178,7 @@ def hunt(path: Path, hunter: Hunt, progress: Callable[[int, int], None] | None =
                     writer.fail(segment.segment_id, config.rollouts, rate.failed, segment.group)
                 elif saved.rollouts and not writer.has(segment.segment_id):
                     writer.add(saved)
-                if progress is not None:
-                    progress(len(found), len(items))
+                progress(len(found), len(items))
     if not found:
         raise ConfigError("the ego of no run segment can be driven")
     if all(one.failed for one in found):

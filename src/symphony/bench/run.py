@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from symphony.bench.suite import Crowd, Suite, SuitePlanner, Threshold
 from symphony.errors import AllFailedError, DataError
 from symphony.evaluation.planners import Record, crowd_differences, run_score
 from symphony.evaluation.report import Report, report
-from symphony.files import Lock, write_file, write_json
+from symphony.files import Lock, read_object, write_file, write_json
 from symphony.render.viewer import view_page
 from symphony.rollouts.crowd import crowd_dataset
 from symphony.saved.folder import RolloutFolder
@@ -35,7 +34,7 @@ EVENTS |= {"red_lights": "runs a red light", "offroad_time": "leaves the road"}
 Status = Literal["passes", "fails", "undecided"]
 
 
-Progress = Callable[[str, int, int], None] | None
+Progress = Callable[[str, int, int], None]
 """Called with a pair's name, the runs done and their total."""
 
 
@@ -130,7 +129,7 @@ class Result:
         }
 
 
-def run_suite(suite: Suite, out: Path, progress: Progress = None, *, view: bool = True) -> Result:
+def run_suite(suite: Suite, out: Path, progress: Progress = lambda *_: None, *, view: bool = True) -> Result:
     """Simulate and judge a suite; an interrupted one continues where it stopped. The folder ``out`` receives
     ``result.json`` and, below ``PLANNER/CROWD``, the rollouts, with a page that plays them if ``view`` is true.
 
@@ -181,11 +180,9 @@ def _drive(suite: Suite, pair: Pair, before: Record, progress: Progress) -> None
     pair.report.agent = pair.name
     for part in range(min(ROUNDS, len(suite.items))):
         items = suite.items[part::ROUNDS]
-        done = len(pair.runs)
 
-        def tell(segments: int, total: int, done: int = done) -> None:
-            if progress is not None:
-                progress(pair.name, done + segments * config.rollouts, pair.planned)
+        def tell(count: int, _: int, done: int = len(pair.runs)) -> None:
+            progress(pair.name, done + count * config.rollouts, pair.planned)
 
         folder = save_simulation(
             pair.folder,
@@ -198,7 +195,7 @@ def _drive(suite: Suite, pair: Pair, before: Record, progress: Progress) -> None
         ).only(suite.store.ids[i] for i in items)
         about, found = folder.about, report(folder, "ego")
         pair.traffic = {"driver": about.drivers["interactive"], "settings": dict(about.settings)}
-        if "settings" in before:  # which earlier versions did not write
+        if before:
             now = before | pair.traffic
             both = ({**one, "crowd": one["driver"], "store": dict(about.store)} for one in (now, before))
             if differing := crowd_differences(*both):
@@ -294,7 +291,7 @@ def _earlier(suite: Suite) -> dict[tuple[str, str], Record]:
     if not isinstance(suite.baseline, Path):
         return {}
     try:
-        found = json.loads(suite.baseline.read_text(encoding="utf-8"))
+        found = read_object(suite.baseline)
         if found["format"] != FORMAT:
             raise DataError(f"has format {found['format']}, not {FORMAT}", file=suite.baseline)
         if found["store"]["checksum"] != suite.store.checksum():

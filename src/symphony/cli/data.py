@@ -36,8 +36,9 @@ class Generate(shared.Command):
     seed: int = 0  # Seed of the networks: another one gives other networks.
     #: Use of the run segments: the three splits never share a network, except for roads of your own.
     split: Literal["train", "validation", "test"] = "train"
-    #: Kinds of network that take turns, with commas between: town, grid, ramp (freeways), street (towns with cars
-    #: parked at the kerb), or files with your own roads: OpenDRIVE (.xodr), OpenStreetMap (.osm) or SUMO (.net.xml).
+    #: Kinds of network that take turns, with commas between: town, grid, ramp (freeways), street (towns where cars
+    #: are parked and people walk and cycle), or files with your own roads: OpenDRIVE (.xodr), OpenStreetMap (.osm) or
+    #: SUMO (.net.xml).
     kinds: str = "town"
     duration: Literal[10, 20, 30] = 10  # Seconds of a run segment.
     interactive: int = 2  # Vehicles that must be present and move at the first step.

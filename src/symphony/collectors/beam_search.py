@@ -89,11 +89,6 @@ class BeamSearchResult:
         """Effective sample size before each pruning, between 1 and S."""
         return None if self.log_weights is None else sample_size(self.log_weights)
 
-    @property
-    def descendants(self) -> Int[Tensor, "*b P S"]:
-        """The number of leaves whose history contains what a slot simulated in a period."""
-        return torch.zeros_like(self.parents).scatter_add(-1, self.slots, torch.ones_like(self.slots))
-
 
 def beam_search(
     env: EnvBase,

@@ -38,7 +38,7 @@ from symphony.data.sources.base import unexpected
 from symphony.data.store import TWICE, SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
-from symphony.files import write_json
+from symphony.files import read_object, write_json
 from symphony.parallel import Engine, ordered_map
 
 PART_BYTES, PART_FILES = 8 << 20, 64  # small files go together: a part is some 60 files to write and delete
@@ -170,7 +170,7 @@ def convert(
     reader_options: Mapping[str, Any] | None = None,
     workers: int = 1,
     engine: Engine = "local",
-    progress: Progress | None = None,
+    progress: Progress = lambda *_: None,
 ) -> Report:
     """Convert logs into a segment store.
 
@@ -245,7 +245,7 @@ def convert(
             rules = exclude_overlaps, radius, hold_lights, strict
             how = Preparation(reader, 1 / rate, smooth, interactive, *rules)
             try:
-                report = _collected(how, job, folder, workers, engine, progress or (lambda *_: None))
+                report = _collected(how, job, folder, workers, engine, progress)
             except (ConfigError, DataError):
                 if all(part.suffix for part in (folder / PARTS).iterdir()):  # none is complete
                     _remove(folder)
@@ -302,7 +302,7 @@ def read_job(folder: Path) -> Job | None:
     if not path.is_file():
         return None
     try:
-        job = Job(**store_format.read_json(path))
+        job = Job(**read_object(path))
         sound = [*map(type, vars(job).values())] == [dict, list, dict]
         if not sound or not all(type(time) is int for time in job.changed.values()):
             raise TypeError("parts of other types")
@@ -426,7 +426,7 @@ def info(path: str | Path) -> dict[str, Any]:
     }
 
 
-def merge(paths: Sequence[Path], out: Path, progress: Told | None = None) -> SegmentStore:
+def merge(paths: Sequence[Path], out: Path, progress: Told = lambda *_: None) -> SegmentStore:
     """Copy all segments of some stores, in their order, into a new one, which appears once it is complete.
 
     Its report joins theirs. ``progress`` is told how many segments are done, of how many. A :class:`DataError` names
@@ -464,8 +464,7 @@ def merge(paths: Sequence[Path], out: Path, progress: Told | None = None) -> Seg
             report = Report.from_json(store.report).after(report)
             for index in range(len(store)):
                 writer.copy(store, index)
-                if progress is not None:
-                    progress(len(writer), total)
+                progress(len(writer), total)
     report = replace(report, converted=total, settings={"merged": [store.path.name for store in stores]})
     writer.write_report(report.to_json())
     draft.rename(out)

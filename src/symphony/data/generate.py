@@ -208,7 +208,7 @@ def generate(
     *,
     workers: int = 1,
     engine: Engine = "local",
-    progress: Callable[[int, Generation], None] | None = None,
+    progress: Callable[[int, Generation], None] = lambda *_: None,
 ) -> Generation:
     """Carry out a plan, or continue one that was interrupted at any moment; a finished store is left as it is.
 
@@ -239,8 +239,7 @@ def generate(
                         writer.append(segment, tags={"kind": result.task.kind, "network": result.task.name})
                 state.add(result, len(writer) == plan.segments)
                 _report(writer, settings, state)
-                if progress is not None:
-                    progress(len(writer), state)
+                progress(len(writer), state)
                 if state.complete:
                     break
                 barren = 0 if len(writer) > before or result.segments else barren + 1
@@ -261,9 +260,8 @@ def _begun(store: SegmentStore, settings: Mapping[str, Any]) -> Generation:
     if "generation" not in report or there.get("reader") != "generate":
         message = "is a segment store that was not generated: refusing to write into it"
         raise DataError(message, file=store.path)
-    gone = {"parked": 0.0, "pedestrians": 0}  # what settings of earlier releases must have been
-    for name, value in {**gone, **settings}.items():
-        made = there.get(name, gone.get(name))
+    for name, value in settings.items():
+        made = there.get(name)
         if made != value:
             old, new = (",".join(map(str, v)) if isinstance(v, list) else v for v in (made, value))
             raise ConfigError(

@@ -128,8 +128,7 @@ def from_ego(segment: RunSegment) -> RunSegment:
     if not 0 < first * segment.dt <= LATE + 1e-6 or segment.num_steps - first < 2:
         return segment
     there = np.asarray(segment.valid[:, first:].any(axis=1))
-    timed = {name: getattr(segment, name)[:, first:].copy() for name in (*STATES, "signal_state")}
-    later = segment.replace(current_step=max(segment.current_step - first, 0), **timed)
+    later = segment.during(slice(first, None), current_step=max(segment.current_step - first, 0))
     return noted(with_agents(later, there), {LATE_EGO: f"{first} of {segment.num_steps}"})
 
 

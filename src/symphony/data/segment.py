@@ -60,6 +60,7 @@ Ints = NDArray[np.integer[Any]]
 Bools = NDArray[np.bool_]
 Check = tuple[str, bool, str]  # field, whether it holds, and what is wrong if it doesn't
 STATES = ("position", "heading", "velocity", "valid")  # a row for each agent, a column for each step
+TIMED = (*STATES, "signal_state")
 
 
 class AgentType(IntEnum):
@@ -104,6 +105,11 @@ class SignalState(IntEnum):
     GO = 6
     FLASHING_STOP = 7
     FLASHING_CAUTION = 8
+
+
+RED = (SignalState.STOP, SignalState.ARROW_STOP)
+AMBER = (SignalState.CAUTION, SignalState.ARROW_CAUTION)
+GREEN = (SignalState.GO, SignalState.ARROW_GO)
 
 
 @dataclass(frozen=True)
@@ -224,6 +230,10 @@ class RunSegment:
     def replace(self, **changes: Any) -> RunSegment:
         """Return a copy with some fields changed."""
         return dataclasses.replace(self, **changes)
+
+    def during(self, steps: slice, **changes: Any) -> RunSegment:
+        """Return what is known of some of the steps, with other fields changed."""
+        return self.replace(**{name: getattr(self, name)[:, steps] for name in TIMED}, **changes)
 
 
 def content_hash(segment: RunSegment | RoadMap) -> str:

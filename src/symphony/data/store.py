@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from symphony.data import segment as schema
 from symphony.data.segment import Polylines, RoadMap, RunSegment, content_hash, validate
-from symphony.data.store_format import MAPS, REPORT, SEGMENTS, Table, check_header, read_json
+from symphony.data.store_format import MAPS, REPORT, SEGMENTS, Table, check_header
 from symphony.errors import DataError
+from symphony.files import read_object
 
 TWICE = "a segment of this name is in the store already"
 GROUP, GOAL, NETWORK = "group", "_goal", "network"
@@ -251,7 +252,7 @@ class SegmentStore(Sequence[RunSegment]):
         order = sorted(range(len(self)), key=self.ids.__getitem__)
         return hashlib.sha256(self._segments["hash"][order].tobytes()).hexdigest()
 
-    def verify(self, progress: Callable[[int, int], None] | None = None) -> None:
+    def verify(self, progress: Callable[[int, int], None] = lambda *_: None) -> None:
         """Read everything, and compare it with the hashes and the schema; the tags must be JSON. A :class:`DataError`
         names the first segment that has changed. ``progress`` gets done and total.
         """
@@ -264,14 +265,13 @@ class SegmentStore(Sequence[RunSegment]):
                 raise DataError("two segments of this name", file=self.path, segment=name, field="segment_id")
             self._check(row, self._read(row))
             self._unseen[row] = False
-            if progress is not None:
-                progress(row + 1, len(self))
+            progress(row + 1, len(self))
 
     @property
     def report(self) -> dict[str, Any]:
         """The conversion report (empty where none was written)."""
         path = self.path / REPORT
-        return read_json(path) if path.exists() else {}
+        return read_object(path) if path.exists() else {}
 
     def summary(self) -> dict[str, Any]:
         """Return counts and ranges over the whole store, as JSON can hold them; reads no agent or map data."""

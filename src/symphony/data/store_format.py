@@ -14,7 +14,6 @@ Columns with one row per agent, say, share an *axis*; records hold first row and
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.errors import DataError
-from symphony.files import Lock
+from symphony.files import Lock, read_object
 
 FORMAT = "symphony segment store"
 VERSION = 1
@@ -140,24 +139,11 @@ def check_header(folder: Path) -> None:
         if folder.name and folder.with_name(folder.name + PARTIAL).is_dir():
             message += "; there is an unfinished conversion to that name: its command continues it"
         raise DataError(message, file=folder)
-    found = read_json(path)
+    found = read_object(path)
     if found != header():
         kind = f"{found.get('format')!r} of version {found.get('version')!r}"
         message = f"is {kind}; this release reads a {FORMAT} of version {VERSION}"
         raise DataError(f"{message}, with its own columns", file=path)
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Parse a JSON object; a :class:`DataError` if it can't be read, or is not one."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"can't be read: {error.strerror or error}", file=path) from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"not valid JSON ({error})", file=path) from error
-    if not isinstance(found, dict):
-        raise DataError("not a JSON object", file=path)
-    return found
 
 
 def lock(folder: Path) -> Lock:

@@ -244,24 +244,19 @@ def _follow(
 
 
 class ConstantVelocity(TensorDictModuleBase):
-    """Keeps speed and heading, the least an agent must beat. Displacements need the time step ``dt`` in seconds."""
+    """Keeps speed and heading, the least an agent must beat."""
 
     in_keys = [keys.STATE]  # noqa: RUF012 - the type TensorDictModuleBase declares
     out_keys = [keys.ACTION]  # noqa: RUF012
 
-    def __init__(self, dynamics: Bicycle | Displacement, dt: float | None = None) -> None:
+    def __init__(self, dynamics: Bicycle) -> None:
         super().__init__()
-        if dt is None and not isinstance(dynamics, Bicycle):
-            raise ConfigError("to keep a speed by displacements, the time step must be known")
-        self.dynamics, self.dt = dynamics, dt
+        self.dynamics = dynamics
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action [..., N] or [..., N, 2]."""
+        """Write the action [..., N]."""
         speed = tensordict.get(keys.STATE)[..., 3]
-        if isinstance(self.dynamics, Bicycle):
-            action = torch.full_like(speed, self.dynamics.num_actions // 2, dtype=torch.int64)
-        else:
-            action = torch.stack([speed * self.dt, torch.zeros_like(speed)], -1)
+        action = torch.full_like(speed, self.dynamics.num_actions // 2, dtype=torch.int64)
         return tensordict.set(keys.ACTION, action)
 
 

@@ -270,8 +270,8 @@ def few(size: int) -> int:
     return size if size <= COORDINATES else -(-size // step) * step
 
 
-def collate(scenes: Sequence[SceneBatch], agents: int = 0, shapes: dict[str, list[int]] | None = None) -> SceneBatch:
-    """Stack scenes into one batch, padded to the largest of each size, and to ``agents`` interactive agents.
+def collate(scenes: Sequence[SceneBatch], *, shapes: dict[str, list[int]] | None = None) -> SceneBatch:
+    """Stack scenes into one batch, padded to the largest of each size.
 
     Padded steps repeat nothing: they are masked by ``log_valid`` and lie past ``last_step``. ``shapes`` of batches so
     far, by field, let this one be no smaller, and its sizes :func:`few`, for programs that are compiled for shapes:
@@ -293,8 +293,6 @@ def collate(scenes: Sequence[SceneBatch], agents: int = 0, shapes: dict[str, lis
         values = [part[name] for part in parts]
         each = {value.shape[1:] for value in values}
         shape = [max(sizes) for sizes in zip(*each, strict=True)]
-        if name in _AGENT_FIELDS:
-            shape[0] = max(shape[0], agents)
         if shapes is not None:
             known = name in (*_AGENT_FIELDS, *_TIMED_FIELDS)
             shape = [*shape[:known], *map(few, shape[known:])]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import from_numpy
 
 from symphony.data.levels import levels_of
-from symphony.data.segment import RunSegment, SignalState
+from symphony.data.segment import GREEN, RED, RunSegment
 from symphony.geometry import levels_apart
 from symphony.geometry.polylines import stations_along
 from symphony.metrics.kinds import STANDING
@@ -30,8 +30,6 @@ Bools = NDArray[np.bool_]
 Heights = NDArray[np.float32] | None
 """Height and level [..., 2] of places; None where the map has no levels, so that all are on one."""
 
-RED = (SignalState.STOP, SignalState.ARROW_STOP)
-GREEN = (SignalState.GO, SignalState.ARROW_GO)
 SAME_WAY = math.pi / 2  # largest angle between an agent and its lane
 WRONG_WAY = 2 * math.pi / 3  # smallest angle between an agent and a lane that it drives the wrong way
 IN_LANE = 2.0  # metres from a centre line within which an agent is in the lane

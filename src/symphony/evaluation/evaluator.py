@@ -69,7 +69,7 @@ def evaluate(
     agent: Agent | str,
     data: SegmentStore | SceneDataset | Path,
     config: EvaluateConfig | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda *_: None,
     *,
     items: Sequence[int] | None = None,
     baselines: bool = False,
@@ -131,8 +131,7 @@ def evaluate(
                 for item, saved in zip(numbers, seen, strict=True):
                     observe(item, saved)
             done += len(numbers)
-            if progress is not None:
-                progress(done, len(dataset))
+            progress(done, len(dataset))
     # The evaluated agent itself where it is one of the baselines.
     named = {evaluation.agent: evaluation for evaluation in found}
     return dataclasses.replace(found[0], baselines=tuple(named[other.name] for other in others))

@@ -30,7 +30,7 @@ _CHUNK = 64
 
 
 def measure(
-    store: SegmentStore, *, interactive: int = 2, progress: Callable[[int, int], None] | None = None
+    store: SegmentStore, *, interactive: int = 2, progress: Callable[[int, int], None] = lambda *_: None
 ) -> dict[str, Any]:
     """Measure the logged driving of the interactive agents (see ``interactive_agents``) in every segment.
 
@@ -57,8 +57,7 @@ def measure(
                 sums[name].append(values)
         for group in alike.values():
             sums["fit_error"].append(_fit_error(group))
-        if progress is not None:
-            progress(min(begin + _CHUNK, len(store)), len(store))
+        progress(min(begin + _CHUNK, len(store)), len(store))
     if not (count := len(sums["collided"])):
         raise DataError(f"no segment has {interactive} interactive agents", file=store.path)
     found = {name: np.concatenate(values) for name, values in sums.items()}

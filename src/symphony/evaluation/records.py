@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any
 from symphony.agents.checkpoint import checkpoints
 from symphony.agents.choice import PREFIX, choose, split_name
 from symphony.config import EvaluateConfig
-from symphony.data.store_format import read_json
 from symphony.errors import ConfigError, DataError
-from symphony.files import write_json
+from symphony.files import read_object, write_json
 
 if TYPE_CHECKING:
     from symphony.agents import Agent
@@ -150,7 +149,7 @@ def kept_evaluations(run: Path) -> dict[str, dict[str, Any]]:
 
 def read_evaluation(file: Path) -> dict[str, Any]:
     """Read a kept evaluation (see :func:`evaluation_record`); a DataError says what it lacks."""
-    record = read_json(file)
+    record = read_object(file)
     if (found := record.get("format")) != FORMAT:
         raise DataError(f"format {found!r}, this version reads {FORMAT}", file=file, field="format")
     if not isinstance(record.get("segments"), int):
@@ -183,7 +182,7 @@ def choose_evaluation(run: Path, kept: Mapping[str, Any], patterns: Sequence[str
 
 def read_run(folder: Path) -> dict[str, Any]:
     """Read the configuration of a run as it is written; a DataError says that it can't be, or names no method."""
-    config = read_json(folder / "config.json")
+    config = read_object(folder / "config.json")
     if not isinstance(config.get("method"), str):
         raise DataError("is missing", file=folder / "config.json", field="method")
     return config

@@ -208,8 +208,7 @@ class SceneDataset:
             why = f"has {(segment.num_steps - 1) * segment.dt:g} s, {self.duration:g} are asked for"
             why += "; only open traffic that is simulated, not evaluated or learned from, goes on past the log"
             raise DataError(why, file=self.store.path, segment=segment.segment_id)
-        timed = ("position", "heading", "velocity", "valid", "signal_state")
-        return segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})
+        return segment.during(slice(steps))
 
     def graph(self, i: int) -> LaneGraph:
         """Return the lane graph of item ``i``; segments on one map share it."""

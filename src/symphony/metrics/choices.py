@@ -21,9 +21,7 @@ TURNS = ("right", "straight", "left")
 TURNED = math.radians(45)  # a route turns where its direction has changed by this much since its beginning
 
 
-def route_turns(
-    points: Float[Tensor, "*b K 2"], count: Int[Tensor, "*b"], turned: float = TURNED
-) -> Int[Tensor, "*b"]:
+def route_turns(points: Float[Tensor, "*b K 2"], count: Int[Tensor, "*b"]) -> Int[Tensor, "*b"]:
     """Return which way routes first turn, as the place in :data:`TURNS`; straight on where they never do. Takes the
     points of each route, in metres, and how many of them exist.
     """
@@ -31,7 +29,7 @@ def route_turns(
     direction = torch.atan2(step[..., 1], step[..., 0])
     change = functional.pad(wrap(direction.diff(dim=-1)).cumsum(-1), (0, 1))  # two points turn nowhere
     exists = torch.arange(change.shape[-1], device=points.device) < (count[..., None] - 2)
-    turns = (change.abs() > turned) & exists
+    turns = (change.abs() > TURNED) & exists
     first = turns.int().argmax(-1, keepdim=True)
     way = change.gather(-1, first).squeeze(-1).sign().long()
     return torch.where(turns.any(-1), way, torch.zeros_like(way)) + 1

@@ -101,20 +101,6 @@ class BoundedDisplacement(_Reachable):
         self.loc, self.scale, self.pace, self.slope, self.reach = loc, scale, pace, slope, reach
         super().__init__(loc.shape[:-1], loc.shape[-1:], validate_args=validate_args)
 
-    def expand(
-        self, batch_shape: torch.Size | Sequence[int], _instance: Distribution | None = None
-    ) -> BoundedDisplacement:
-        """Return the same distribution expanded to a larger batch."""
-        shape = torch.Size(batch_shape)
-        return BoundedDisplacement(
-            self.loc.expand(*shape, 2),
-            self.scale.expand(*shape, 2),
-            self.pace.expand(shape),
-            self.slope.expand(shape),
-            self.reach,
-            validate_args=False,
-        )
-
     def displacement(self, u: Pairs) -> Pairs:
         """Return the displacement that Gaussian numbers [..., 2] stand for."""
         return displaced(squash(u), self.pace, self.slope, self.reach)

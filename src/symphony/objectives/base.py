@@ -24,9 +24,9 @@ class MaskedLoss(LossModule):
 
     Args:
         reduction: `"mean"` (also for None), `"sum"` or `"none"`.
-        use_mask: use of the mask under the `valid` key. None: it counts where there is one, and must be there if the
-            network (or the environment) reads it, too, so that no padding is trained on unnoticed. True: it must be
-            there. False: it is not read.
+
+    A mask under the `valid` key counts where there is one, and must be there if the network (or the environment)
+    reads it, too, so that no padding is trained on unnoticed.
 
     Attributes:
         share_count: set where processes train together: takes a count of this process to the mean over all, so that
@@ -35,13 +35,12 @@ class MaskedLoss(LossModule):
 
     share_count: Callable[[Int[Tensor, ""]], Num[Tensor, ""]] | None = None
 
-    def __init__(self, reduction: Reduction | None, use_mask: bool | None) -> None:
+    def __init__(self, reduction: Reduction | None) -> None:
         super().__init__()
         self._in_keys: list[NestedKey] | None = None
         self.reduction: Reduction = "mean" if reduction is None else reduction
         if self.reduction not in ("mean", "sum", "none"):
             raise ValueError(f"unknown reduction {reduction!r}, expected 'mean', 'sum' or 'none'")
-        self.use_mask = use_mask
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         pass
@@ -59,10 +58,7 @@ class MaskedLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """The keys that the loss reads: the network's inputs, the labels and, where there is one, the mask."""
         if self._in_keys is None:
-            keys = self._read_keys()
-            if self.use_mask is not False:
-                keys.append(self.tensor_keys.valid)
-            self._in_keys = list(dict.fromkeys(keys))
+            self._in_keys = list(dict.fromkeys([*self._read_keys(), self.tensor_keys.valid]))
         return self._in_keys
 
     @in_keys.setter
@@ -70,13 +66,11 @@ class MaskedLoss(LossModule):
         self._in_keys = values
 
     def _mask(self, tensordict: TensorDictBase) -> Shaped[Tensor, "*b"] | None:
-        """Return the entry under the `valid` key, by the rule of `use_mask`."""
-        if self.use_mask is False:
-            return None
+        """Return the entry under the `valid` key, if there is one; it must be there if the network reads it, too."""
         key = unravel_key(self.tensor_keys.valid)
         mask = tensordict.get(key, default=None)
-        if mask is None and (self.use_mask or key in self._read_keys()):
-            raise KeyError(f"no mask under {key!r}; pass use_mask=False to train without one")
+        if mask is None and key in self._read_keys():
+            raise KeyError(f"no mask under {key!r}, which the network reads")
         return mask
 
     def _entries(
@@ -149,7 +143,6 @@ class ActorLoss(MaskedLoss):
     Args:
         actor_network: probabilistic module with a `get_dist`.
         reduction: see :class:`MaskedLoss`.
-        use_mask: see :class:`MaskedLoss`.
     """
 
     losses: ClassVar[tuple[str, ...]] = ()
@@ -162,9 +155,8 @@ class ActorLoss(MaskedLoss):
         actor_network: ProbabilisticTensorDictSequential | ProbabilisticTensorDictModule,
         *,
         reduction: Reduction | None = None,
-        use_mask: bool | None = None,
     ) -> None:
-        super().__init__(reduction, use_mask)
+        super().__init__(reduction)
         self.convert_to_functional(actor_network, "actor_network")
         heads = [m for m in actor_network.modules() if isinstance(m, ProbabilisticTensorDictModule)]
         kind = heads[-1].distribution_class if heads else None
@@ -219,7 +211,6 @@ class BCLoss(ActorLoss):
         actor_network: probabilistic module with a `get_dist`.
         reduction: `"mean"` over the valid entries (0 if there are none), `"sum"`, or `"none"`, which keeps the
             shape `[...]` of the log-probability, with zeros at invalid entries.
-        use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_bc`, and for categorical actors, detached, `entropy` of the actor and `accuracy` of its mode
     (means over the valid entries; without reduction per entry like the loss).
@@ -265,7 +256,6 @@ class DistillationLoss(ActorLoss):
         actor_network: probabilistic module with a `get_dist`, over discrete or continuous actions.
         reduction: `"mean"` as above (0 for a kind that is absent), `"sum"`, or `"none"`, which keeps the shape
             `[...]` of the log-probability, zeros where an entry does not count.
-        use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_distillation` and, detached, `nll_expert` and `nll_rollout` (unweighted);
     for categorical actors also `entropy` and `accuracy` on the expert entries, as :class:`BCLoss` does. They are

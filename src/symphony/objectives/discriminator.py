@@ -31,7 +31,6 @@ class DiscriminatorLoss(MaskedLoss):
             gamma is twice this weight). It supposes that a logit depends on its own entry's inputs only.
         reduction: `"mean"` as above (0 for a kind that is absent); `"sum"` over all entries that count; `"none"`,
             which keeps the shape `[..., N]`, with zeros elsewhere. The penalty is reduced and added alike.
-        use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_discriminator` and, detached, per kind the share classified right `accuracy_simulated` and
     `accuracy_data`, the mean logits `score_simulated` and `score_data`, and `auc` of the logits (0.5: cannot tell;
@@ -70,9 +69,8 @@ class DiscriminatorLoss(MaskedLoss):
         *,
         gradient_penalty: float = 0.0,
         reduction: Reduction | None = None,
-        use_mask: bool | None = None,
     ) -> None:
-        super().__init__(reduction, use_mask)
+        super().__init__(reduction)
         if not (math.isfinite(gradient_penalty) and gradient_penalty >= 0.0):
             raise ValueError(f"gradient_penalty must be at least 0, is {gradient_penalty}")
         self.convert_to_functional(discriminator, "discriminator")

@@ -29,7 +29,6 @@ class GoalLoss(MaskedLoss):
             its parameters is run. G may differ from call to call.
         reduction: `"mean"` over the entries that count (0 if there are none), `"sum"`, or `"none"`, which keeps the
             shape `[..., N]`, with zeros at the others.
-        use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_goal` and, detached, `entropy`, `accuracy` (the likeliest goal is the label, or in its set) and
     `accuracy_top3`: means over the entries that count; without reduction per entry like the loss.
@@ -64,10 +63,8 @@ class GoalLoss(MaskedLoss):
     goal_network_params: TensorDictParams
     target_goal_network_params: TensorDictParams
 
-    def __init__(
-        self, goal_network: TensorDictModuleBase, *, reduction: Reduction | None = None, use_mask: bool | None = None
-    ) -> None:
-        super().__init__(reduction, use_mask)
+    def __init__(self, goal_network: TensorDictModuleBase, *, reduction: Reduction | None = None) -> None:
+        super().__init__(reduction)
         self.convert_to_functional(goal_network, "goal_network")
         self.out_keys = ["loss_goal", "entropy", "accuracy", "accuracy_top3"]
 

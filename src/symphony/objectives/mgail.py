@@ -47,7 +47,6 @@ class MGAILLoss(MaskedLoss):
         until_done: False if ends of episodes are to change nothing at all.
         compile_step: compile actor, environment and score of a step, or how, as :func:`torch.compile` takes it.
         reduction: `"mean"` or `"sum"` over entries that count, or `"none"`, `[..., T, N]`.
-        use_mask: whether a mask under the `valid` key is read: None where there is one, see :class:`MaskedLoss`.
 
     Writes `loss_mgail` and, detached, the mean logit `mgail_score`. Steps after the first `done` do not count.
 
@@ -96,9 +95,8 @@ class MGAILLoss(MaskedLoss):
         until_done: bool = True,
         compile_step: bool | Mapping[str, Any] = False,
         reduction: Reduction | None = None,
-        use_mask: bool | None = None,
     ) -> None:
-        super().__init__(reduction, use_mask)
+        super().__init__(reduction)
         if cost not in COSTS:
             raise ValueError(f"unknown cost {cost!r}, expected one of {', '.join(COSTS)}")
         for name, value in (("horizon", horizon), ("truncate", truncate)):

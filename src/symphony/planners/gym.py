@@ -170,8 +170,7 @@ class DrivingGym(gymnasium.Env[Observed, Any]):
         segment = self.store[number]
         if self.duration:
             steps = max(round(self.duration / segment.dt), 1) + 1
-            timed = ("position", "heading", "velocity", "valid", "signal_state")
-            segment = segment.replace(**{name: getattr(segment, name)[:, :steps] for name in timed})
+            segment = segment.during(slice(steps))
         self._scene = scene(segment, [segment.ego], LaneGraph(segment.road), number=number)
         self.segment, self.segment_id, ends = segment, segment.segment_id, self.ends_on
         self._before, self._told = [], None

@@ -6,11 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from symphony.data.segment import SignalState
 from symphony.planners.interface import Pose, Scenario, Traffic
 
-RED = (SignalState.STOP, SignalState.ARROW_STOP)
-AMBER = (SignalState.CAUTION, SignalState.ARROW_CAUTION)
 BEFORE, BEYOND = 50.0, 10_000.0
 """Metres by which a route goes straight on before its start and past its end."""
 VIEW = 100.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -108,7 +108,7 @@ class Regions:
 class LaneGraph:
     """Lanes, how they connect, and their shapes; built once per map.
 
-    Lanes of an excluded type, and those that are a single point (WOMD has some, as stubs), keep their index but are
+    Lanes for bicycles, and those that are a single point (WOMD has some, as stubs), keep their index but are
     not connected to anything and match no position. Takes a :class:`symphony.data.segment.RoadMap`, and raises a
     :class:`DataError` for a connection to a lane that does not exist.
 
@@ -128,14 +128,14 @@ class LaneGraph:
         gentle: results for lanes that were checked already, see :func:`symphony.roadgraph.paths.gentle`.
     """
 
-    def __init__(self, road: Any, *, exclude: Collection[int] = (BIKE_LANE,)) -> None:
+    def __init__(self, road: Any) -> None:
         points, offsets = np.asarray(road.lanes.points, dtype=np.float64)[:, :2], road.lanes.offsets
         new = np.insert((points[1:] != points[:-1]).any(1), 0, True)
         new[offsets[:-1]] = True
         self.lines = [points[a:b][new[a:b]] for a, b in pairwise(offsets)]
         self.arc = [arc_lengths(line) for line in self.lines]
         self.length: Reals = np.array([arc[-1] for arc in self.arc], dtype=np.float64)
-        self.usable: Bools = ~np.isin(np.asarray(road.lane_type), list(exclude)) & (self.length > 0)
+        self.usable: Bools = (np.asarray(road.lane_type) != BIKE_LANE) & (self.length > 0)
         self.successors = self._adjacency(road.successors, "road.successors")
         self.predecessors = self._adjacency(np.asarray(road.successors)[:, ::-1], "road.successors")
         self.left = self._adjacency(road.left_neighbors, "road.left_neighbors")

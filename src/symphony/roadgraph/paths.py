@@ -14,6 +14,7 @@ from symphony.roadgraph.graph import LaneGraph, Reals, arc_lengths
 
 CHORD = 3.0
 """Metres of a piece of a line that has a direction, and over which a change of direction is measured."""
+SPACING = 0.5  # metres between the points at which such a piece may begin
 GENTLE = 0.09  # radians that a lane turns from one such piece to the next where its radius is 34 m
 _STEP = 1.0  # metres between the points of a blend
 _SMOOTH = 1.5
@@ -111,13 +112,13 @@ def distinct(line: Reals) -> Reals:
     return line[np.concatenate(([True], np.hypot(*np.diff(line, axis=0).T) > CLOSE))]
 
 
-def sharpest(line: Reals, spacing: float = 0.5) -> float:
+def sharpest(line: Reals) -> float:
     """Return the largest change of direction, in radians, between pieces of :data:`CHORD` metres of a line. Pieces
     may begin anywhere. It is 0 for a line that is shorter than two of them.
     """
     arc = arc_lengths(line)
-    points = at(line, arc, np.arange(0.0, arc[-1], spacing))
-    apart = round(CHORD / spacing)
+    points = at(line, arc, np.arange(0.0, arc[-1], SPACING))
+    apart = round(CHORD / SPACING)
     way = points[apart:] - points[:-apart]
     if len(way) <= apart:
         return 0.0

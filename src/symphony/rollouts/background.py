@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from symphony import keys
-from symphony.data.segment import SignalState
+from symphony.data.segment import AMBER, RED, SignalState
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.dynamics import WHEELBASE, bicycle_step
 from symphony.envs.objects import Objects
@@ -132,7 +132,7 @@ class CarFollower(TensorDictModuleBase):
         shown = scenes.light[row, at.clamp(max=scenes.light.shape[1] - 1)]
         gap = line.stop - front[:, None]
         in_time = gap > (speed.square() / (2.0 * self.driver.braking))[:, None]
-        stops = _among(shown, included.RED) | (_among(shown, included.AMBER) & in_time)
+        stops = _among(shown, RED) | (_among(shown, AMBER) & in_time)
         return pad(torch.where(stops & (gap > -2.0), gap, torch.inf), (0, 1), value=torch.inf).amin(-1)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from symphony.data.segment import RunSegment, SignalState
+from symphony.data.segment import AMBER, GREEN, RunSegment, SignalState
 from symphony.roadgraph import LaneGraph
 from symphony.roadgraph.graph import turn_between
 
@@ -21,8 +21,6 @@ Rows = NDArray[np.intp]
 
 USUAL = (25.0, 3.0, 2.0)  # seconds of green, amber and all red of a phase
 JUNCTION = 40.0  # metres between stop points, from one to the next, within which lights are of one junction
-GREEN = (SignalState.GO, SignalState.ARROW_GO)
-AMBER = (SignalState.CAUTION, SignalState.ARROW_CAUTION)
 ARROW = (SignalState.ARROW_STOP, SignalState.ARROW_CAUTION, SignalState.ARROW_GO)
 _ALWAYS = (SignalState.UNKNOWN, SignalState.FLASHING_STOP, SignalState.FLASHING_CAUTION)
 

@@ -21,7 +21,6 @@ from symphony.saved.rollouts import PLAYBACK, SavedRollouts, World, world_of
 
 Reals = NDArray[np.float64]
 
-NOMINAL_WIDTH, BIKE_WIDTH = 3.6, 1.6  # metres, of lanes whose width is not known
 TRUCK = 7.0  # metres of length from which a vehicle is a truck
 STRAIGHT = 0.5  # radians that a lane may turn and still lead straight on
 
@@ -151,10 +150,7 @@ class _Network:
 
     def _lanelet(self, root: ET.Element, k: int, refs: list[tuple[str, int]]) -> None:
         node = _add(root, "lanelet", id=self.ids[k])
-        width, kind = float(self.road.lane_width[k]), LaneType(self.road.lane_type[k])
-        if not np.isfinite(width):
-            width = BIKE_WIDTH if kind == LaneType.BIKE_LANE else NOMINAL_WIDTH
-        aside = 0.5 * width * normals(self.lines[k])
+        kind, aside = LaneType(self.road.lane_type[k]), 0.5 * self.road.widths[k] * normals(self.lines[k])
         for tag, bound in (("leftBound", self.lines[k] + aside), ("rightBound", self.lines[k] - aside)):
             side = _add(node, tag)
             for place in bound:

@@ -25,7 +25,7 @@ from symphony.config.files import from_dict
 from symphony.data.segment import Polylines, RoadMap, RunSegment, validate
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
-from symphony.files import Lock, naming, replacing, write_json
+from symphony.files import Lock, naming, read_object, replacing, write_json
 from symphony.saved.rollouts import SavedRollouts, SavedTrees
 
 KEY = "symphony"  # the name of the JSON in the header of a file
@@ -43,7 +43,6 @@ _TREE_SHAPES = {"state": "fRSTN4", "score": "fRSTN", "totals": "fRPS", "parents"
 _TREE_SHAPES |= dict.fromkeys(("there", "collision", "offroad"), "bRSTN")
 
 FORMAT = 1
-_LATER = {"lights": [], "after_collision": "go-on"}  # what settings mean that older folders lack
 MANIFEST, INDEX, SEGMENTS, LOCK = "manifest.json", "index.jsonl", "segments", "rollouts.lock"
 _KINDS = {"agent": str, "seed": int, "drivers": dict, "settings": dict, "store": dict}
 
@@ -112,7 +111,7 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
             held = _read_manifest(self.path)
             changed = [name for name in manifest if manifest[name] != held.get(name)]
             if "settings" in changed and isinstance(held.get("settings"), dict):
-                now, before = manifest["settings"], _LATER | held["settings"]
+                now, before = manifest["settings"], held["settings"]
                 changed.remove("settings")
                 changed += [f"settings.{n}" for n in {**now, **before} if now.get(n) != before.get(n)]
             # An empty folder belongs to no simulation.
@@ -242,11 +241,8 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     file = path / MANIFEST
     if not file.is_file():
         raise DataError(f"not a folder of rollouts: it has no {MANIFEST}", file=path)
-    try:
-        values = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"not valid JSON ({error})", file=file) from error
-    if not isinstance(values, dict) or values.get("format") != FORMAT:
+    values = read_object(file)
+    if values.get("format") != FORMAT:
         raise DataError(f"of another version, this one reads format {FORMAT}", file=file, field="format")
     return values
 
@@ -310,8 +306,6 @@ def read_tensors(data: bytes, file: Path, segment_id: str) -> SavedRollouts:
 
 
 def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedRollouts:
-    if "log_weight" in arrays:
-        raise DataError("is of a search with a tilt, which was removed: simulate again", field="log_weight")
     kinds = {**_SCALARS, "start": int, "drivers": list, "failed": dict, "logged": int}
     facts = {"logged": 0, "goal": None, **facts}
     for name, kind in (kinds | {"prune_every": int} if "prune_every" in facts else kinds).items():
@@ -342,10 +336,7 @@ def _assembled(arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> SavedR
     drivers = tuple(facts["drivers"])
     failed = {int(number): str(reason) for number, reason in facts["failed"].items()}
     held = {"segment": segment, "start": facts["start"], "drivers": drivers, "failed": failed, "trees": trees}
-    plan = arrays.get("plan")
-    if plan is not None and plan.ndim == 4:  # of the ego alone, as plans were kept once
-        plan = plan[:, None]
-    return built(SavedRollouts, "", **held, plan=plan)
+    return built(SavedRollouts, "", **held, plan=arrays.get("plan"))
 
 
 def _check(saved: SavedRollouts, segment_id: str) -> None:

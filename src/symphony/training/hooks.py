@@ -89,7 +89,7 @@ class Validator:
         self.best: Best | None = None
         self.what = f"{len(chosen)} segments of {store.checksum()}, {config.rollouts} rollouts"
 
-    def __call__(self, step: int, progress: Callable[[int, int], None] | None = None) -> dict[str, float]:
+    def __call__(self, step: int, progress: Callable[[int, int], None] = lambda *_: None) -> dict[str, float]:
         """Return the numbers for the record after an update, all beginning with ``validation_``. The best agent is
         the one whose collision rate plus off-road time is lowest (paper, section V-C).
         """

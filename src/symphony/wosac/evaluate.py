@@ -20,7 +20,7 @@ from symphony.agents import Agent, load_agent
 from symphony.config import WosacSettings
 from symphony.data.report import Skip
 from symphony.data.resample import resample
-from symphony.data.segment import AgentType, RunSegment, SignalState
+from symphony.data.segment import TIMED, AgentType, RunSegment, SignalState
 from symphony.data.selection import relations
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
@@ -35,7 +35,6 @@ from symphony.wosac.simulate import wosac_rollouts
 _AWAY, _APART = 1e5, 1e3  # metres from the origin, and from one another, at which agents do not meet anyone
 _FAR = 1e5
 """Metres from the world's origin beyond which float32, in which all is scored, has steps of a centimetre and more."""
-_TIMED = ("position", "heading", "velocity", "valid", "signal_state")
 
 
 def wosac_window(segment: RunSegment, future: int = FUTURE) -> RunSegment:
@@ -58,7 +57,7 @@ def wosac_window(segment: RunSegment, future: int = FUTURE) -> RunSegment:
     def taken(values: Any) -> Any:
         return np.pad(values[:, :steps], [(0, 0), (missing, 0), *[(0, 0)] * (values.ndim - 2)])
 
-    found = {name: taken(getattr(tenth, name)) for name in _TIMED}
+    found = {name: taken(getattr(tenth, name)) for name in TIMED}
     back = np.arange(-missing, 0)[:, None] * DT
     found["position"][:, :missing] = tenth.position[:, :1]
     found["position"][:, :missing, :2] += tenth.velocity[:, :1] * back
@@ -124,8 +123,7 @@ class PassingGaps(NamedTuple):
 def passing_pairs(window: RunSegment) -> NDArray[np.int64]:
     """Return [K, 2] rows of the vehicles that merge or cross in the log after the current step, both valid at it."""
     now = window.current_step
-    later = {name: getattr(window, name)[:, now::EVERY] for name in _TIMED}
-    future = window.replace(dt=window.dt * EVERY, current_step=0, **later)
+    future = window.during(slice(now, None, EVERY), dt=window.dt * EVERY, current_step=0)
     rows = np.flatnonzero(window.valid[:, now] & (window.agent_type == AgentType.VEHICLE))
     pairs = []
     for k, row in enumerate(rows[:-1]):

@@ -11,7 +11,7 @@ import numpy as np
 
 from symphony.data.npz import read_npz
 from symphony.data.report import Skip
-from symphony.errors import DataError
+from symphony.errors import ConfigError, DataError
 from symphony.parallel import ordered_map
 from symphony.wosac import scorer
 from symphony.wosac.records import logged_scenario, parse_scenario, read_scenarios
@@ -100,6 +100,8 @@ def score_files(
     Returns the mean over scenarios, their own scores and what was left out, for JSON; and what was left out. A
     :class:`DataError` names file, scenario, agent and field where rollouts don't fit, or no scenario can be scored.
     """
+    if config not in scorer.CHALLENGES:
+        raise ConfigError(f"config must be one of {', '.join(scorer.CHALLENGES)}, is {config}")
     total = len(list(rollouts.glob("*.npz"))) if rollouts.is_dir() else 1
     results: list[dict[str, Any]] = []
     skipped: list[Skip] = []

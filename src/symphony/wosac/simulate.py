@@ -27,7 +27,7 @@ from symphony.agents import Agent
 from symphony.config import WosacSettings
 from symphony.data.odd import mended
 from symphony.data.resample import wrap
-from symphony.data.segment import AgentType, RunSegment, SignalState, validate
+from symphony.data.segment import GREEN, RED, AgentType, RunSegment, SignalState, validate
 from symphony.data.sources.womd import scenario_to_segment
 from symphony.envs.routes import route_table
 from symphony.envs.scene import MapEdge, beyond, map_edge, scene
@@ -47,8 +47,6 @@ STILL = 0.2
 AHEAD, ASIDE = 60.0, 3.0  # metres ahead and to a side within which a light is a vehicle's own
 PACE, COURSE = 0.4, 0.17
 """How much people's speeds (a share) and courses (radians, 10 degrees) differ between rollouts, either way."""
-_GO = (SignalState.ARROW_GO, SignalState.GO)
-_STOP = (SignalState.ARROW_STOP, SignalState.STOP)
 
 
 def standing(segment: RunSegment) -> NDArray[np.bool_]:
@@ -67,7 +65,7 @@ def standing(segment: RunSegment) -> NDArray[np.bool_]:
     cos, sin = np.cos(segment.heading[:, now, None]), np.sin(segment.heading[:, now, None])
     along, aside = cos * delta[..., 0] + sin * delta[..., 1], cos * delta[..., 1] - sin * delta[..., 0]
     own = (along > 0) & (along < AHEAD) & (np.abs(aside) < ASIDE)
-    green, red = ((own & np.isin(shown, states)).any(1) for states in (_GO, _STOP))
+    green, red = ((own & np.isin(shown, states)).any(1) for states in (GREEN, RED))
     return np.asarray(still & ~(green & ~red))
 
 

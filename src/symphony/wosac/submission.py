@@ -7,8 +7,11 @@ and the same metadata in all of them.
 from __future__ import annotations
 
 import contextlib
+import glob
 import gzip
+import os
 import re
+import shutil
 import tarfile
 import tempfile
 import zlib
@@ -22,6 +25,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from symphony.errors import ConfigError, DataError
+from symphony.files import lives, naming
 from symphony.wosac import wosac_pb2 as pb
 from symphony.wosac.meta import SubmissionMeta
 from symphony.wosac.records import parse_scenario, read_scenarios, simulated_ids
@@ -109,24 +113,31 @@ def write_submission(
         raise ConfigError(f"{field}: {problem}")
     seen: set[str] = set()
     out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
+    for left in out.parent.glob(f".{glob.escape(out.name)}.*.*"):  # by a process that was killed
+        if (process := left.suffixes[-2][1:]).isdigit() and not lives(int(process)):
+            shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.{os.getpid()}.") as folder:
         parts = [Path(folder) / shard_name(shard, shards) for shard in range(shards)]
         with contextlib.ExitStack() as stack:
             files = [stack.enter_context(part.open("wb")) for part in parts]
             for number, (name, arrays) in enumerate(rollouts):
-                if name in seen:
-                    raise DataError("more than once", segment=name, field="scenario_id")
+                if name in seen or not name:
+                    raise DataError("more than once" if name else "missing", segment=name, field="scenario_id")
                 seen.add(name)
                 # Messages one after the other are one message with the scenarios of all.
                 part = pb.SimAgentsChallengeSubmission(scenario_rollouts=[scenario_message(name, arrays)])
-                files[number % shards].write(part.SerializeToString())
+                with naming(out):
+                    files[number % shards].write(part.SerializeToString())
             if len(seen) < shards:
                 raise ConfigError(f"{len(seen)} scenarios don't fill {shards} shards")
-            for file in files:
-                file.write(message.SerializeToString(deterministic=True))
-        packed = Path(folder) / "packed"
-        _pack(parts, packed)
-        packed.replace(out)
+            with naming(out):
+                for file in files:
+                    file.write(message.SerializeToString(deterministic=True))
+                    file.close()
+        with naming(out):
+            packed = Path(folder) / "packed"
+            _pack(parts, packed)
+            packed.replace(out)
     return len(seen)
 
 
