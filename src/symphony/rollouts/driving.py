@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from symphony import keys
 from symphony.agents import Agent
+from symphony.agents.agent import SearchPlan
 from symphony.collectors import Backtrack, BeamSearchResult, KeepAll, PruningRule
 from symphony.config import EvaluateConfig
 from symphony.config.evaluation import Compile, Search, SimulateConfig
@@ -98,96 +99,141 @@ def simulation(
     if agent.policy is None and int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > len(egos):
         raise ConfigError("beside log playback those with a planner are the only interactive agents")
     agent.check_step(float(scenes.dt[0]))
-    compiled = config.compile == "yes"
-    after = config.after_collision if isinstance(config, SimulateConfig) else "go-on"
-    seen = with_few_steps(scenes) if compiled else scenes
-    env = PlannedEnv(seen, agent.dynamics, agent.observation, after_collision=after)
-    kind, trees, branches, taken, settings = agent.plan(config)
-    searches = kind not in ("none", "log")
-    guard = NaNGuard(env, policy, [keys.LOGITS, keys.ACTION], "policy")
-    goals = None if agent.goals is None else NaNGuard(env, agent.goals, [keys.GOAL_LOGITS], "goal policy")
-    asked = agent.discriminator if searches else None
-    scorer = None if asked is None else NaNGuard(env, asked, [keys.SCORE], "discriminator", scores=True)
-
-    def fixed(scene: Tensor, goal: Tensor) -> Tensor:
-        return _fixed(scenes, scene, goal, given, along_log=config.others == "idm", planned=len(egos))
-
-    def renewed(state: TensorDictBase, attempt: Tensor) -> TensorDictBase:
-        if goals is None or config.logged_goals:
-            return state
-        # Where the likely routes have led to trouble again and again, others are tried.
-        heat = (attempt - FIRST_TRIES).clamp_min(1)[:, None].float()
-        goal = draw_goals(env, goals, state, config.seed, state.get(keys.STREAM).squeeze(-1), heat)
-        return env.with_goals(state, fixed(state.get(keys.SCENE).squeeze(-1), goal))
-
-    start = start_states(
-        env,
-        goals,
-        trees=trees,
-        branches=branches,
-        seed=config.seed,
-        logged_goals=config.logged_goals,
-        goals_per=settings.goals,
-        fix=fixed,
-    )
-    if egos and (kind == "backtrack" or compiled):
+    compiled, plan = config.compile == "yes", agent.plan(config)
+    if egos and (plan.kind == "backtrack" or compiled):
         what = "so it can't go back: --search none or tree, and is not compiled: --compile no"
         raise ConfigError(f"a planner remembers what it saw, {what}")
+    after = config.after_collision if isinstance(config, SimulateConfig) else "go-on"
+    env = PlannedEnv(
+        with_few_steps(scenes) if compiled else scenes, agent.dynamics, agent.observation, after_collision=after
+    )
+    searches = plan.kind not in ("none", "log")
+    guard = NaNGuard(env, policy, [keys.LOGITS, keys.ACTION], "policy")
+    network = None if agent.goals is None else NaNGuard(env, agent.goals, [keys.GOAL_LOGITS], "goal policy")
+    asked = agent.discriminator if searches else None
+    scorer = None if asked is None else NaNGuard(env, asked, [keys.SCORE], "discriminator", scores=True)
+    goals = _Goals(env, network, scenes, config, given, len(egos))
+    start = goals.start(plan)
     planned = EgoPolicy(env, egos, start, config.seed, CarFollower, forked=searches) if egos else None
     lure = None if toward is None else toward(env, start)
     actor = TensorDictSequential(guard, RULES[config.others](env)) if config.others in RULES else guard
     for module in (planned, lure):
         actor = actor if module is None else TensorDictSequential(actor, module)
-    # The rollouts [B, trees, taken] that count, of all branches.
-    chosen, tree = torch.arange(taken, device=env.device).expand(len(scenes), trees, -1), None
-    if not searches and not compiled:
+    order = torch.arange(plan.taken, device=env.device).expand(len(scenes), plan.trees, -1)
+    if searches or compiled:
+        how: dict[str, Any] = {
+            "planned": len(egos),
+            "also": () if planned is None else (keys.PLANNER,),
+            "keep_tree": keep_tree and plan.kind == "tree",
+            "value": no_value if plan.kind == "none" else lure and lure.value,
+            "compile_step": COMPILER if compiled else False,
+        }
+        made = _searched(env, actor, scorer, start, config, plan, goals, order, how)
+    else:
         noise = SeededNoise(config.seed, env.dynamics.numbers, config.pace)
         found = simulate(env, TensorDictSequential(noise, actor), start)
-        steps, ends, goal = start.numel() * env.decisions, start, start.get(keys.GOAL)
-    else:
-        rule: PruningRule | Backtrack = KeepAll() if kind == "none" else pruning_rule(settings)
-        if kind == "backtrack":
-            rule = going_back(env, settings.threshold, start.numel(), renewed)
-        with torch.no_grad():
-            result = search(
-                env,
-                actor,
-                scorer,
-                start,
-                seed=config.seed,
-                pace=config.pace,
-                rule=rule,
-                prune_every=settings.prune_every,
-                score=settings.score,
-                planned=len(egos),
-                also=() if planned is None else (keys.PLANNER,),
-                leaves=taken,
-                keep_tree=keep_tree and kind == "tree",
-                value=no_value if kind == "none" else lure and lure.value,
-                compile_step=COMPILER if compiled else False,
-            )
-        found, steps = rollouts_of(env, start, result.trajectories), result.simulated_steps
-        ends = result.trajectories[..., -1]  # a copy of a branch follows the goals of its parent
-        goal = ends.get(keys.GOAL)
-        if kind == "tree":
-            tree = result
-        elif kind == "backtrack":
-            # Lines are trees of one branch each; to be filled from each other they are the branches of one.
-            begun = result.alive.squeeze(-2)[..., :: result.prune_every]
-            # What follows an end is never bad.
-            totals = torch.where(begun, result.totals.squeeze(-1), -torch.inf)
-            chosen = filled_lines(totals, settings.threshold)[:, None]
-            found, goal = Rollouts(*(part.transpose(1, 2) for part in found)), goal.transpose(1, 2)
-    for network in (goals, guard, scorer):
-        if network is not None:
-            network.check()
-    rollouts = Rollouts(*(_branches(part, chosen).flatten(1, 2) for part in found))
-    drawn = None if tree is None else start.get(keys.GOAL)
-    goal = _branches(goal, chosen).flatten(1, 2)
-    whole = Simulation(rollouts, goal, tree, rollouts.collision, steps, drawn=drawn)
+        made = _Made(found, start, start.get(keys.GOAL), order, start.numel() * env.decisions)
+    for module in (network, guard, scorer):
+        if module is not None:
+            module.check()
+    rollouts = Rollouts(*(_branches(part, made.order).flatten(1, 2) for part in made.rollouts))
+    drawn = None if made.tree is None else start.get(keys.GOAL)
+    goal = _branches(made.goal, made.order).flatten(1, 2)
+    whole = Simulation(rollouts, goal, made.tree, rollouts.collision, made.steps, drawn=drawn)
     if planned is None:
         return whole
-    return _without_failed(whole, planned, _branches(ends.get(keys.PLANNER), chosen).flatten(1, 2))
+    return _without_failed(whole, planned, _branches(made.ends.get(keys.PLANNER), made.order).flatten(1, 2))
+
+
+class _Goals(NamedTuple):
+    """The goals of agents: drawn from a network, but for those that are given."""
+
+    env: PlannedEnv
+    network: NaNGuard | None
+    scenes: SceneBatch
+    config: EvaluateConfig
+    given: Int[Tensor, "B N"] | None
+    planned: int  # how many of the first agents are
+
+    def start(self, plan: SearchPlan) -> TensorDictBase:
+        """Return the first states [B, trees, S]."""
+        return start_states(
+            self.env,
+            self.network,
+            trees=plan.trees,
+            branches=plan.branches,
+            seed=self.config.seed,
+            logged_goals=self.config.logged_goals,
+            goals_per=plan.search.goals,
+            fix=self.fixed,
+        )
+
+    def fixed(self, row: Int[Tensor, "*b"], goal: Int[Tensor, "*b N"]) -> Int[Tensor, "*b N"]:
+        """Return the goals that agents follow in rows of the scenes instead of drawn ones: the first ones, which are
+        planned, and background agents that IDM drives those of the log, others those that are given.
+        """
+        followed = self.scenes.route_logged[row]
+        if self.given is not None:
+            goal = torch.where(self.given[row] >= 0, self.given[row], goal)
+        if self.config.others == "idm":
+            goal = torch.where(self.scenes.background[row], followed, goal)
+        # Scenes without routes have no number of one either.
+        along = self.planned * bool(self.scenes.route_point.shape[1])
+        return torch.cat([followed[..., :along], goal[..., along:]], -1)
+
+    def renewed(self, state: TensorDictBase, attempt: Int[Tensor, " R"]) -> TensorDictBase:
+        """Return first states of lines that went back, with other goals: where the likely ones have led to trouble
+        again and again, others are tried.
+        """
+        if self.network is None or self.config.logged_goals:
+            return state
+        heat = (attempt - FIRST_TRIES).clamp_min(1)[:, None].float()
+        stream = state.get(keys.STREAM).squeeze(-1)
+        goal = draw_goals(self.env, self.network, state, self.config.seed, stream, heat)
+        return self.env.with_goals(state, self.fixed(state.get(keys.SCENE).squeeze(-1), goal))
+
+
+class _Made(NamedTuple):
+    """All that was simulated [B, trees, S]: rollouts, their last states and goals; which of them count, in order
+    [B, trees, K]; and the search, if they are leaves of trees.
+    """
+
+    rollouts: Rollouts
+    ends: TensorDictBase
+    goal: Int[Tensor, "B trees S N"]
+    order: Int[Tensor, "B trees K"]
+    steps: int
+    tree: BeamSearchResult | None = None
+
+
+def _searched(
+    env: PlannedEnv,
+    actor: TensorDictModuleBase,
+    scorer: NaNGuard | None,
+    start: TensorDictBase,
+    config: EvaluateConfig,
+    plan: SearchPlan,
+    goals: _Goals,
+    order: Int[Tensor, "B trees K"],
+    how: dict[str, Any],
+) -> _Made:
+    """Simulate by a search, or by one that prunes nothing, for a step that is compiled."""
+    rule: PruningRule | Backtrack = KeepAll() if plan.kind == "none" else pruning_rule(plan.search)
+    if plan.kind == "backtrack":
+        rule = going_back(env, plan.search.threshold, start.numel(), goals.renewed)
+    about: dict[str, Any] = {"prune_every": plan.search.prune_every, "score": plan.search.score, "leaves": plan.taken}
+    with torch.no_grad():
+        result = search(env, actor, scorer, start, seed=config.seed, pace=config.pace, rule=rule, **about, **how)
+    ends = result.trajectories[..., -1]  # a copy of a branch follows the goals of its parent
+    found, goal = rollouts_of(env, start, result.trajectories), ends.get(keys.GOAL)
+    if plan.kind == "backtrack":
+        # Lines are trees of one branch each; to be filled from each other they are the branches of one.
+        begun = result.alive.squeeze(-2)[..., :: result.prune_every]
+        # What follows an end is never bad.
+        totals = torch.where(begun, result.totals.squeeze(-1), -torch.inf)
+        order = filled_lines(totals, plan.search.threshold)[:, None]
+        found, goal = Rollouts(*(part.transpose(1, 2) for part in found)), goal.transpose(1, 2)
+    return _Made(found, ends, goal, order, result.simulated_steps, result if plan.kind == "tree" else None)
 
 
 def simulate_batch(agent: Agent, scenes: SceneBatch, config: EvaluateConfig, **how: Any) -> Simulation:
@@ -220,22 +266,6 @@ def _check_given(agent: Agent, config: EvaluateConfig, given: Int[Tensor, "B N"]
         raise ConfigError(f"{agent.name} is no learned agent, so a pace has no effect")
     if given is not None and agent.goals is None and not agent.rule and bool((given >= 0).any()):
         raise ConfigError(f"{agent.name} follows no goals, so a given one has no effect")
-
-
-def _fixed(
-    scenes: SceneBatch, row: Tensor, goal: Tensor, given: Tensor | None, *, along_log: bool, planned: int
-) -> Tensor:
-    """Return the goals [*b, N] that agents follow in rows [*b] of the scenes instead of drawn ones: the first ones,
-    which are planned, and background agents, if asked for, those of the log, others those that are given.
-    """
-    followed = scenes.route_logged[row]
-    if given is not None:
-        goal = torch.where(given[row] >= 0, given[row], goal)
-    if along_log:
-        goal = torch.where(scenes.background[row], followed, goal)
-    # Scenes without routes have no number of one either.
-    along = planned * bool(scenes.route_point.shape[1])
-    return torch.cat([followed[..., :along], goal[..., along:]], -1)
 
 
 def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Simulation:
