@@ -50,7 +50,7 @@ class Train(shared.Command):
         shared.say(f"evaluate it    symphony evaluate {shlex.quote(str(folder))} --data DIR")
 
 
-class Evaluate(shared.Simulation):
+class Evaluate(shared.SimulationOptions):
     """Simulate the interactive agents of every run segment and compare them with the log.
 
     The log itself and agents at constant velocity are evaluated beside the agent. A run keeps the results as

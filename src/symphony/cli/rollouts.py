@@ -18,7 +18,7 @@ from symphony.cli import shared
 from symphony.config import EvaluateConfig, checks, evaluation
 
 
-class Simulate(shared.Simulation):
+class Simulate(shared.SimulationOptions):
     """Simulate the interactive agents of every run segment and keep the rollouts.
 
     An interrupted simulation is continued by the same command. View them with `symphony view`, evaluate them with

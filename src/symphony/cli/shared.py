@@ -50,7 +50,7 @@ class Command:
         dataclass(frozen=True, kw_only=True)(cls)
 
 
-class Simulation(Command):
+class SimulationOptions(Command):
     """The options of a simulation: an agent on run segments."""
 
     #: Folder of a run (see `symphony train`), `pretrained:NAME` (an agent of the package), `playback` (the log

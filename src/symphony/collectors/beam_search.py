@@ -169,13 +169,13 @@ def beam_search(
     how = start.shape, policy, score, aggregate, keep, until_done, one_step, start, written, value
     # One program for lines that go back, also when the last of them are few.
     width = min(rule.width or start.numel(), start.numel()) if isinstance(rule, Backtrack) else 0
-    simulation = Simulation(env, whole, *how, width if compile_step else 0)
+    simulator = Simulator(env, whole, *how, width if compile_step else 0)
     ended = _ended(env, start, start.ndim) & until_done
     with set_exploration_type(exploration_type), branched_specs(policy, start.shape[:-1], start.shape):
         if isinstance(rule, Backtrack):
             if leaves not in (None, branches):
                 raise ValueError("rule Backtrack gives all branches as leaves")
-            lines = follow(simulation.run, simulation.total, start, ended, rule, steps, min(prune_every, steps))
+            lines = follow(simulator.run, simulator.total, start, ended, rule, steps, min(prune_every, steps))
             return _independent(lines, prune_every, keep_tree)
         periods = [min(prune_every, steps - first) for first in range(0, steps, prune_every)]
         pruning = Pruning(start, rule, len(periods), group_key=group_key, noise=noise, accumulate=accumulate)
@@ -183,7 +183,7 @@ def beam_search(
         worth: Any = None if value is None else 0.0
         terminated = _ended(env, start, start.ndim, "terminated") & ended
         for period, length in enumerate(periods):
-            run = simulation.run(now, ended, length, terminated)
+            run = simulator.run(now, ended, length, terminated)
             records += run.records
             scores.append(run.scores)
             alive.append(run.alive)
@@ -191,7 +191,7 @@ def beam_search(
             last = period == len(periods) - 1
             active = run.alive[..., 0, :].any(-1).any(-1)
             kept = None if prune_last else last | run.ended.flatten(-2).all(-1)  # rows whose last period this was
-            parents = pruning.prune(simulation.total(run), active, worth, kept)
+            parents = pruning.prune(simulator.total(run), active, worth, kept)
             if not last:
                 place = _places(parents, start)
                 now, ended = take(run.after, place), take_values(run.ended, place, start.ndim)
@@ -204,18 +204,7 @@ def beam_search(
     del records
     tree.refine_names(..., "time")
     simulated_scores, counted = torch.cat(scores, -2), torch.cat(alive, -2).any(-1)
-    totals, seen, parents = (torch.stack(part, -2) for part in (pruning.totals, pruning.seen, pruning.parents))
-    slots, (log_weights, evidence) = lineage(parents), pruning.last_weights()
-    # In later periods all branches of a row that has ended are equal.
-    last_period = (torch.stack(pruning.active, -1).sum(-1) - 1).clamp_min(0)[..., None, None]
-    costs, named = (part.take_along_dim(last_period, -2).squeeze(-2) for part in (seen, slots))
-    costs = costs.gather(-1, named)
-    if accumulate:  # of which a rule that weighs sees a part
-        costs = totals.gather(-1, slots).sum(-2) + (0.0 if worth is None else worth.gather(-1, slots[..., -1, :]))
-    if leaves is not None:
-        best = ranking(costs, named)[..., :leaves]
-        slots, costs = slots.take_along_dim(best[..., None, :], -1), costs.gather(-1, best)
-        log_weights = None if log_weights is None else log_weights.gather(-1, best)
+    slots, costs, log_weights, evidence = _leaves(pruning, worth, leaves)
     # The place of each leaf's steps in the flattened tree [*b, S, T].
     step = torch.arange(steps, device=slots.device)
     place = _places(slots, start).transpose(-1, -2)[..., step // prune_every] * steps + step
@@ -226,8 +215,8 @@ def beam_search(
         scores=take_values(simulated_scores, place, tree.batch_dims),
         alive=take_values(counted, place, tree.batch_dims),
         slots=slots,
-        totals=totals,
-        parents=parents,
+        totals=torch.stack(pruning.totals, -2),
+        parents=torch.stack(pruning.parents, -2),
         simulated_scores=simulated_scores,
         tree=tree if keep_tree else None,
         prune_every=prune_every,
@@ -237,6 +226,25 @@ def beam_search(
         leaf_log_weights=log_weights,
         log_evidence=evidence,
     )
+
+
+def _leaves(
+    pruning: Pruning, worth: Float[Tensor, "*b S"] | None, count: int | None
+) -> tuple[Int[Tensor, "*b P L"], Float[Tensor, "*b L"], Float[Tensor, "*b L"] | None, Float[Tensor, "*b"] | None]:
+    """Return `slots`, `leaf_costs`, `leaf_log_weights` and `log_evidence` of the `count` best leaves, or of all."""
+    totals, seen, parents = (torch.stack(part, -2) for part in (pruning.totals, pruning.seen, pruning.parents))
+    slots, (log_weights, evidence) = lineage(parents), pruning.last_weights()
+    # In later periods all branches of a row that has ended are equal.
+    last_period = (torch.stack(pruning.active, -1).sum(-1) - 1).clamp_min(0)[..., None, None]
+    costs, named = (part.take_along_dim(last_period, -2).squeeze(-2) for part in (seen, slots))
+    costs = costs.gather(-1, named)
+    if pruning.accumulate:  # of which a rule that weighs sees a part
+        costs = totals.gather(-1, slots).sum(-2) + (0.0 if worth is None else worth.gather(-1, slots[..., -1, :]))
+    if count is not None:
+        best = ranking(costs, named)[..., :count]
+        slots, costs = slots.take_along_dim(best[..., None, :], -1), costs.gather(-1, best)
+        log_weights = None if log_weights is None else log_weights.gather(-1, best)
+    return slots, costs, log_weights, evidence
 
 
 def _independent(
@@ -251,7 +259,7 @@ def _independent(
 
 
 @dataclass(frozen=True)
-class Simulation:
+class Simulator:
     """The simulation and scoring of branches; `whole` is the environment for all, [*b, S] of a `shape`."""
 
     env: EnvBase
