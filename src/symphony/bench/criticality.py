@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from symphony.data.levels import agent_heights, levels_of
-from symphony.data.segment import RunSegment
+from symphony.data.segment import RunSegment, wrap
 from symphony.data.store import SegmentStore
 from symphony.evaluation.contacts import time_to_collision
 from symphony.geometry import box_corners, levels_apart
@@ -116,7 +116,7 @@ def _encroachment(world: World, segment: RunSegment, seen: NDArray[np.int64]) ->
     apart = np.abs(mine - step) * segment.dt
     # A follower in a lane reaches each place soon after: that is a headway.
     turn = world.heading[segment.ego, mine] - world.heading[who, step]
-    crosses = np.abs((turn + np.pi) % (2 * np.pi) - np.pi) > CROSSING
+    crosses = np.abs(wrap(turn)) > CROSSING
     if world.height is not None:
         places = ((segment.ego, mine), (who, step))
         one, two = (torch.from_numpy(world.height[place]) for place in places)

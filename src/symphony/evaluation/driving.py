@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import from_numpy
 
 from symphony.data.levels import levels_of
-from symphony.data.segment import GREEN, RED, RunSegment
+from symphony.data.segment import GREEN, RED, RunSegment, wrap
 from symphony.geometry import levels_apart
 from symphony.geometry.polylines import stations_along
 from symphony.metrics.kinds import STANDING
@@ -320,7 +320,7 @@ def comfort(saved: SavedRollouts, evaluated: Indices) -> tuple[Reals, Reals, Rea
     state = np.where(saved.there[:, :, evaluated][..., None], state, np.nan)
     speed, heading = state[..., 3], state[..., 2]
     acceleration = np.diff(speed, axis=1) / dt
-    turn = (np.diff(heading, axis=1) + np.pi) % (2 * np.pi) - np.pi
+    turn = wrap(np.diff(heading, axis=1))
     jerk = np.diff(acceleration, axis=1, prepend=np.nan) / dt
     return acceleration, jerk, 0.5 * (speed[:, 1:] + speed[:, :-1]) * turn / dt
 

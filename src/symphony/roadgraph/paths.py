@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from symphony.roadgraph.graph import LaneGraph, Reals, arc_lengths
+from symphony.roadgraph.graph import LaneGraph, Reals, arc_lengths, turn_between
 
 CHORD = 3.0
 """Metres of a piece of a line that has a direction, and over which a change of direction is measured."""
@@ -123,7 +123,7 @@ def sharpest(line: Reals) -> float:
     if len(way) <= apart:
         return 0.0
     angle = np.arctan2(way[:, 1], way[:, 0])
-    return float(np.abs((angle[apart:] - angle[:-apart] + np.pi) % (2 * np.pi) - np.pi).max())
+    return float(turn_between(angle[apart:], angle[:-apart]).max())
 
 
 def gentle(graph: LaneGraph, lane: int) -> bool:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -21,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.segment import Polylines, content_hash
+from symphony.data.segment import Polylines, content_hash, wrap
 from symphony.errors import DataError
 from symphony.files import finite
 
@@ -154,7 +153,7 @@ class _Packer:
 
     def states(self, name: str, state: NDArray[Any]) -> None:
         """Add states [..., T, 4], zero where there are none."""
-        heading = np.remainder(state[..., 2].astype(np.float64) + math.pi, 2 * math.pi) - math.pi
+        heading = wrap(state[..., 2].astype(np.float64))
         for axis, letter in enumerate("xy"):
             self.add(f"{name}.{letter}", "i32", state[..., axis], MILLIMETRE, delta=True)
         self.add(f"{name}.h", "i16", heading, ANGLE)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from symphony.data.segment import AgentType, Bools, Floats, SignalState
+from symphony.data.segment import AgentType, Bools, Floats, SignalState, wrap
 from symphony.data.sources.base import Doubles
 from symphony.data.sources.sumo.networks import KERB
 from symphony.data.sources.sumo.process import run_program
@@ -298,7 +298,7 @@ def _smooth(front: Doubles, heading: Doubles, length: Doubles, wander: Doubles) 
     ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
     center = axles[0] + (at_front - length / 2)[..., None] * ahead
     angle = np.arctan2(ahead[..., 1], ahead[..., 0])
-    turn = np.nan_to_num((np.diff(angle, axis=1) + np.pi) % (2 * np.pi) - np.pi)
+    turn = np.nan_to_num(wrap(np.diff(angle, axis=1)))
     start = np.nan_to_num(angle[np.arange(len(angle)), np.argmax(np.isfinite(angle), axis=1)])
     unwrapped = start[:, None] + np.pad(np.cumsum(turn, axis=1), ((0, 0), (1, 0)))
     return center, np.where(np.isfinite(angle), unwrapped, np.nan)
