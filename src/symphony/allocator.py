@@ -22,8 +22,8 @@ def tune() -> bool:
 
 
 def release() -> bool:
-    """Give free pages, wherever in the heap, back to the system, once in many steps; return whether any were. Else a
-    long training's heap would grow without end: what stays settles where a large block was freed.
+    """Give free pages from anywhere in the heap back to the system; return whether any were. Call it once in many
+    steps: otherwise a long training's heap grows without end, as lasting blocks settle where large ones were freed.
     """
     return bool((library := _ours()) and library.malloc_trim(0))
 

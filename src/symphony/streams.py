@@ -22,7 +22,7 @@ class Stream(IntEnum):
     ENTRIES = (1 << 40) + 6  # vehicles that enter past the log
     WALKS = (1 << 40) + 5  # walks of people that are not driven
     PACE = (1 << 40) + 7  # how fast an agent is in a whole rollout
-    BACKTRACKING = 1 << 41  # lines that go back, each of its tries: this and how many there were
+    BACKTRACKING = 1 << 41  # tries of a line that goes back: this number plus how often it went back so far
 
 
 # SplitMix64: Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014.

@@ -89,11 +89,11 @@ def estimate(
     """Return the mean of the values of some runs (None where not defined; a rate's are 0 and 100) and its one-sided
     bounds over groups, each with a confidence between 0.5 and 1.
 
-    Bounds of a mean are Student's t, with the degrees of freedom of as many equal groups as weigh alike; of a
-    difference of rates or shares not nearer than the bound of a rate where nothing happened; of means that are the
-    same in all groups unknown. Those of a rate or a share, of which few runs may be far from all others, are the
-    exact binomial ones of as many independent runs as the scatter between groups says there are, and of as many as
-    there are groups where nothing or everything happened.
+    The bounds of a mean are by Student's t, with the degrees of freedom of the effective number of equal groups, and
+    unknown if all groups have the same mean. For a difference of rates or shares they are no nearer than the bound of
+    a rate where nothing happened. A rate or a share, where few runs can be far from all others, has exact binomial
+    bounds: for as many independent runs as the scatter between groups implies or, where nothing or everything
+    happened, for as many as there are groups.
     """
     known = [(value, group) for value, group in zip(values, groups, strict=True) if value is not None]
     value = np.array([value for value, _ in known], np.float64)

@@ -70,9 +70,9 @@ class Rate:
     """The rate of an event in a run segment: a share, its standard error over trees, in how many trees it was seen,
     how many of the runs that show it are kept, and why there is no share where the planner failed.
 
-    ``segment`` is None for the mean over segments that have a share; its error is that for these, not for others.
-    NaN: the metric is not defined there, or, of an error, nothing was seen that would have one. A share above 1 is no
-    mistake: with few branches the estimate scatters to both sides.
+    ``segment`` is None for the mean over segments that have a share; its error holds for these segments alone. A NaN
+    share means that the metric is not defined there or the planner failed, a NaN error that the event was not seen. A
+    share above 1 is no mistake: with few branches the estimate scatters to both sides.
     """
 
     segment: str | None

@@ -61,7 +61,7 @@ class Evaluate(shared.SimulationOptions):
     figure: shared.ResultFile = None  # Picture (.png, .pdf or .svg) or animation (.gif) of some rollouts.
     save_rollouts: shared.Folder = None  # Folder for the rollouts that are evaluated (see `symphony view`).
     details: bool = False  # Print every number of each agent, not only the table (see docs/metrics.md).
-    keep: bool = True  # Whether the folder of the run keeps the results.
+    keep: bool = True  # Keep the results in the folder of the run; `--no-keep` does not.
     #: Import paths of metrics of your own, functions from scenes and rollouts to a number per rollout.
     metric: tuple[str, ...] = ()
     #: More scores for the record and `symphony table`: `wosac` (2025), 32 rollouts of all agents (see docs/wosac.md).

@@ -156,9 +156,9 @@ class Convert(shared.Command):
     rate: Positive = 5.0  # Steps per second in the store (the paper's 5).
     interactive: Count = 2  # Interactive agents a run segment must have at its first step.
     smooth: NotNegative = 0.0  # Smoothing of the tracks before they are resampled: its sigma in seconds.
-    #: Egos of each scenario of CommonRoad or window of INTERACTION: `one`, that with the most moving vehicles around
-    #: it, or `all` moving vehicles seen throughout, with a run segment each; `problem`: of each planning problem of
-    #: CommonRoad, without a log.
+    #: Egos of a CommonRoad scenario or INTERACTION window. `one`: the vehicle with the most moving vehicles around
+    #: it; with `all`, every moving vehicle that is seen throughout, each in its own run segment; with `problem`, the
+    #: ego of each CommonRoad planning problem, which has no log.
     egos: Literal["one", "all", "problem"] = "one"
     window: Positive = 10.0  # Seconds of the run segments that recordings of INTERACTION are cut into.
     #: Seconds between the starts of two windows of INTERACTION; without it, one begins where another ends.
@@ -169,7 +169,7 @@ class Convert(shared.Command):
     radius: Annotated[float | None, Bounds(sys.float_info.min)] = None
     exclude_overlaps: bool = False  # Leave out run segments in which a moving vehicle's box overlaps another.
     hold_lights: bool = False  # Lights keep their last known state where the log has none (docs/formats.md).
-    strict: bool = False  # Skip a record of which something odd would be left out (an agent without a size).
+    strict: bool = False  # Skip a record with anything odd, which is else left out or filled in.
     workers: shared.Workers = 1
     engine: shared.EngineName = "local"
 

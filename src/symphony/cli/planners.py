@@ -23,8 +23,8 @@ Device = Annotated[str, arg(help="Device that simulates: `cpu`, `cuda` or `cuda:
 class Planners(shared.Command):
     """Compare planners, each among several crowds: one table, and which planner is first in each crowd.
 
-    The score of a run is its progress relative to the log's, in percent, at most 100; 0 if it failed, if the planner
-    is at fault in a collision, runs a red light or leaves the road. Runs whose progress is not defined have none.
+    The score of a run is its progress in percent of the log's, at most 100, but 0 if the run failed or the planner is
+    at fault in a collision, runs a red light or leaves the road. Runs whose progress is not defined have no score.
     """
 
     records: shared.SavedFolders

@@ -27,24 +27,24 @@ class Simulate(shared.SimulationOptions):
 
     out: Path  # Folder of the rollouts.
     #: Planner that drives the ego, while the agent drives the other interactive agents: `idm`, `log`, or one of your
-    #: own: a file `my.py:plan`, an import path `my.planner:Planner`, another process `pipe:COMMAND`. Then planners of
-    #: other agents, by their ids in the source: `3=idm`. With `playback` as the agent all others play back the log.
-    #: There is no search unless --search, --branches or --trees say so, as each branch asks the planner: a tree then
-    #: has 4 by default, or as many as its rollouts, if those are more.
+    #: own, as a file `my.py:plan`, an import path `my.planner:Planner` or another process `pipe:COMMAND`. Planners of
+    #: other agents follow, by ids in the source: `3=idm`. With `playback` as the agent, all others play back the log.
+    #: There is no search unless --search, --branches or --trees ask for one, because every branch calls the planner;
+    #: a tree then has 4 branches by default, or as many as it gives rollouts if that is more.
     planner: Annotated[tuple[str, ...], arg(metavar="NAME [ID=NAME ...]")] = ()
     planner_seconds: float = 60.0  # Seconds that a planner has for one answer; a longer one fails the run.
-    #: Least number of runs (rollouts of a segment), as many of each segment used; 0: `rollouts` of every segment.
+    #: Simulate at least this many runs (rollouts) in all, equally many of each segment used; 0: `--rollouts` of each.
     runs: checks.Natural = 0
     #: Goals of agents, by their ids in the source: `7=lane:103` for a route over the lane of that id, `7=12.5,-40`
     #: for one that passes a point (metres, in the frame of the segment); all others as the agent draws them.
     goal: Annotated[tuple[str, ...], arg(metavar="ID=PLACE ...")] = ()
-    tree: bool = True  # Whether the branches that a search pruned are saved, too.
+    tree: bool = True  # Also save the branches that a search pruned; `--no-tree` leaves them out.
     config: Annotated[evaluation.SimulateConfig, arg(name="")] = field(default_factory=evaluation.SimulateConfig)
 
     def __post_init__(self) -> None:
         evaluation.check_planner_seconds(self.planner_seconds)
         if self.runs and (self.segments or self.config.rollouts != EvaluateConfig.rollouts):
-            raise errors.ConfigError("--runs says which segments and rollouts: no --segments, no --rollouts")
+            raise errors.ConfigError("--runs decides the segments and rollouts: omit --segments, --rollouts")
 
     def __call__(self) -> None:
         from symphony.learning.demonstrations import evenly_spaced
@@ -88,7 +88,7 @@ class View(shared.Command):
     """
 
     folders: shared.SavedFolders
-    #: File to write: .html (a page), .png, .pdf, .svg, .gif or .mp4 (with the extra `video`); view.html in the first.
+    #: File to write: .html (a page), .png, .pdf, .svg, .gif or .mp4 (extra `video`); by default view.html in SIM.
     out: shared.ResultFile = None
     segments: shared.Ids = ()
     rollouts: checks.Natural = 0  # Rollouts of a segment in a picture (0: all) or a film (0: one), at most.
@@ -124,7 +124,7 @@ class View(shared.Command):
 
 
 def places(folders: list[Any]) -> list[str]:
-    """Return what tells folders of rollouts apart, as much of the ends of their paths as it takes; nothing of one."""
+    """Return a label for each folder of rollouts: ends of their paths, as short as tells them apart; none for one."""
     parts = [one.path.resolve().parts for one in folders]
     ends = [["/".join(part[-n:]) for part in parts] for n in range(1, 1 + max(map(len, parts)))]
     shortest = next(end for end in ends if len(set(end)) == len(set(parts)))

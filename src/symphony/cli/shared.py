@@ -25,16 +25,16 @@ Paths = Annotated[tuple[Path, ...], checks.Bounds(1), arg(help_behavior_hint="(r
 Names = Annotated[tuple[str, ...], arg(metavar="NAME ...")]
 Folder = Annotated[Path | None, arg(metavar="DIR")]
 ResultFile = Annotated[Path | None, Result(), arg(metavar="FILE")]
-_JSON = "File to write all numbers to as JSON; - for standard output, and nothing else there."
+_JSON = "File to write all results to as JSON; with -, standard output gets the JSON and nothing else."
 Json = Annotated[Path | None, Result(), arg(metavar="FILE", help=_JSON)]
 Picture = Annotated[Path, Result(), arg(metavar="FILE", help="Picture to write (.png, .pdf or .svg).")]
 Store = Annotated[Positional[Path], arg(metavar="DIR", help="Folder of the store.")]
 _SAVED = "Folders of rollouts (`symphony simulate`), such as those of several planners."
 SavedFolders = Annotated[Positional[Paths], checks.Bounds(distinct=True), arg(metavar="SIM ...", help=_SAVED)]
 Saved = Annotated[Positional[Path], arg(metavar="SIM", help="Folder of rollouts (`symphony simulate`).")]
-_SEGMENTS = "Ids of run segments, or their numbers in the store, to use no others."
+_SEGMENTS = "Use only these run segments, named by id or by number in the store."
 Segments = Annotated[tuple[str, ...], arg(metavar="ID ...", help=_SEGMENTS)]
-Ids = Annotated[tuple[str, ...], arg(metavar="ID ...", help="Ids of run segments, to use no others.")]
+Ids = Annotated[tuple[str, ...], arg(metavar="ID ...", help="Use only the run segments with these ids.")]
 _TRUST = "Run the code that the agent's folder names by import paths; without it such a folder is refused."
 TrustCode = Annotated[bool, arg(help=_TRUST)]
 Workers = Annotated[checks.Count, arg(help="Number of processes; it changes the speed, not the results.")]

@@ -69,7 +69,7 @@ class Evaluate(shared.Command):
     config: Year = "2025"
     json: shared.Json = None
     segments: shared.Segments = ()
-    baselines: bool = True  # Whether the baselines are scored, too.
+    baselines: bool = True  # Score the baselines, too; `--no-baselines` leaves them out.
     strict: Strict = False
     trust_code: shared.TrustCode = False
     settings: Annotated[WosacSettings, arg(name="")] = field(default_factory=WosacSettings)

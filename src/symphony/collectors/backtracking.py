@@ -36,13 +36,13 @@ class Backtrack:
     Args:
         threshold: the threshold in the units of the totals.
         back: periods of each try, counted from the end of the bad one (1 repeats that alone); 0 for the first state.
-        cap: lengths of a line that are simulated again, from which on it goes back no more.
+        cap: a line goes back no more once it has repeated this many times its own length.
         renew: ``renew(state, attempt) -> state`` makes the state [R, 1] that lines go on from. It gets the kept
-            entries of the step they go back to and how often each line [R] has gone back so far, and must give them
-            other random numbers than before, and what was not kept of the entries that the start state has. None
-            where everything is kept and numbers come from a global generator.
-        width: lines simulated at a time, the next of which begin as others end: few steps are then of few lines. None
-            for all. It changes memory and speed only.
+            entries of the step they go back to and how often each line [R] has gone back so far. It must give them
+            other random numbers than before, and add the entries of the start state that were not kept. None where
+            everything is kept and numbers come from a global generator.
+        width: lines simulated at a time; a waiting line begins whenever one ends, so that few steps have few lines.
+            None for all at once. It changes memory and speed only.
     """
 
     threshold: float
@@ -59,8 +59,8 @@ class Backtrack:
 
 
 class Course:
-    """The next period `at` of each line [M], how often it went back, `times`, which agents are `excused`, and which
-    may be as they were bad at all its tries, `blame`.
+    """Where each line [M] is: `at` is its next period, `times` how often it went back, `excused` marks agents that no
+    longer count against it, and `blame` those that were bad at all its tries so far and may be excused next.
     """
 
     def __init__(self, rule: Backtrack, lines: int, agents: int, periods: int, device: torch.device) -> None:
@@ -97,10 +97,10 @@ class Course:
 
 
 class Run(NamedTuple):
-    """A period of branches [*b, S] (of lines [R, 1]) as simulated: the kept entries of its steps, their scores, which
-    are 0 after the end of an episode, which steps came before (or were) the end of each agent's episode, or of all
-    agents' (K = 1), which episodes have ended, the last states, their values (or of those that ended episodes), and
-    which of the episodes terminated.
+    """A simulated period of branches [*b, S] or lines [R, 1]: `records` are the kept entries of its steps; `scores`
+    are 0 after the end of an episode; `alive` marks the steps up to that end, of each agent's episode or of the one
+    of all agents (K = 1); `ended` marks episodes that have ended, `terminated` those that terminated; `after` are the
+    last states, and `worth` are their values, or those of the states in which episodes ended.
     """
 
     records: list[TensorDictBase]

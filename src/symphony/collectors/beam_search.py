@@ -55,8 +55,8 @@ class BeamSearchResult:
         tree: [*b, S, T] all simulated steps by slot, if asked for.
         prune_every: T_p; the last period may be shorter.
         simulated_steps: branch-steps that were simulated.
-        leaf_costs: [*b, L] what the rule saw of the leaves in the last period in which their row had not ended; with
-            ``accumulate`` the totals of their whole histories, and their values.
+        leaf_costs: [*b, L] what the rule compared in the last period in which an episode of the row went on; with
+            ``accumulate`` the totals of their whole histories, plus their values.
         log_weights: [*b, P, S] before each pruning, minus the totals since the row was last resampled, by the
             temperature; None unless the rule is a :class:`Systematic`, like the following.
         leaf_log_weights: [*b, L] after the last pruning, relative to the mean weight; 0 if resampled without a value.
@@ -113,8 +113,8 @@ def beam_search(
     compile_step: bool | Mapping[str, Any] = False,
     exploration_type: ExplorationType | None = ExplorationType.RANDOM,
 ) -> BeamSearchResult:
-    """Search an environment whose whole state is in the TensorDict: of the S branches of each row, those with high
-    scores are replaced by copies of the others.
+    """Run a beam search: of the S branches of each row, those with high scores are replaced by copies of the others.
+    The environment must keep its whole state in the TensorDict.
 
     Gradients flow through environment, policy and scores unless the caller turns them off, along the history of each
     leaf; no tensor is changed in place. An episode ends once, with the first ``done`` (terminated or truncated): its

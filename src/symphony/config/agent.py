@@ -72,22 +72,22 @@ class SearchConfig(Settings):
     branches: Size = 4  # Branches per run segment in training (S).
     test_branches: Size = 16  # Branches per run segment in evaluation.
     prune_every: Count = 2  # Steps between prunings (T_p; 10 in the paper).
-    #: Rule that prunes. `best`: the better half of the branches survives (the paper); `systematic`: every branch gets
-    #: copies in proportion to exp(-score / temperature), as in a particle filter, which should prune more often;
-    #: `replace`: branches whose score is above `threshold` are replaced by copies of others, of those with the same
-    #: goals if there are any; or the import path of a pruning rule of your own.
+    #: Rule that prunes. `best`: the better half of the branches survives (the paper); `systematic`: a branch gets
+    #: copies in proportion to exp(-score / temperature), as in a particle filter, and should be pruned more often;
+    #: with `replace`, a branch whose score is above `threshold` makes room for a copy of another, with the same goals
+    #: if there is one; or the import path of a pruning rule of your own.
     rule: Rule = "systematic"
     temperature: Positive = 0.6  # Temperature of rule `systematic`: the lower, the stricter.
     #: Highest score, in logits of the discriminator, with which rule `replace` lets a branch go on.
     threshold: float = 1.0
-    #: Sharing of goals: by all branches of a `tree` (the paper), or not at all, as each `branch` draws its own.
+    #: Whether branches share goals. `tree`: all branches of a tree do (the paper); `branch`: each draws its own.
     goals: Literal["tree", "branch"] = "tree"
     #: Search that the agent is simulated with by default: `tree` (the paper), `backtrack`.
     way: Annotated[Literal["tree", "backtrack"], Fixed, Suppress] = "tree"
     score: Annotated[Score, Fixed, Suppress] = "discriminator"  # Score that this search lowers.
     updates: Count = 10  # Updates made from the results of one search before the next.
-    #: States per update: this many of the surviving rollouts for the policy to learn from, and this many of all
-    #: rollouts and of the log for the discriminator; each is of all interactive agents of its run segment.
+    #: States per update: the policy learns from this many states of the surviving rollouts, the discriminator from
+    #: this many of all rollouts and as many of the log; a state is that of all interactive agents of its run segment.
     states: Count = 256
 
 

@@ -51,27 +51,27 @@ def check_planner_seconds(seconds: float) -> None:
 class SimulationConfig(Settings):
     """Settings of a simulation, whatever the rollouts are for."""
 
-    #: Search that the rollouts come from. `agent`: the agent's own; `none`: no search; `tree`: beam search;
-    #: `backtrack`: independent rollouts, each of which goes back and tries again where it is bad.
+    #: Search that the rollouts come from. `agent`: the one that the agent comes with; `none`: no search; `tree`: beam
+    #: search; `backtrack`: independent rollouts, each of which goes back and tries again where it went wrong.
     search: Search = "agent"
-    #: Score that a search lowers. `agent`: as is best for the agent (the discriminator, unless its card says
-    #: something else); `discriminator`: what the agent's own one calls unreal; `flags`: collisions and time off the
-    #: road; `rule`: the same, and collisions within half a second if all keep speed and course.
+    #: Score that a search keeps low. `agent`: the one that suits the agent best (the discriminator, unless its card
+    #: names another); `discriminator`: how simulated a state looks to the agent's discriminator; `flags`: collisions
+    #: and time off the road; `rule`: these, and collisions within half a second if all keep speed and course.
     score: ScoreName = "agent"
     branches: Natural = 0  # Branches of each tree; 0: as many as the agent's `search.test-branches`.
-    #: Rule that prunes trees: `agent` as it was trained, else see `search.rule` of training.
+    #: Rule that prunes trees. `agent`: the one of the agent's training; `symphony train --help` explains the others.
     rule: Annotated[str, Names(["agent", "best", "systematic", "replace"])] = "agent"
     #: Steps between prunings, or after which a rollout may go back; 0: as the agent was trained.
     prune_every: Natural = 0
     temperature: NotNegative = 0.0  # Temperature of rule `systematic`; 0: as the agent was trained.
-    #: Highest score of a good branch, for rule `replace` and for `backtrack`; by default as the agent was trained,
-    #: and 0 for scores that count what is bad (`flags`, `rule`).
+    #: Score above which a branch is bad, for `--rule replace` and `--search backtrack`; by default that of the
+    #: agent's training, or 0 with the scores `flags` and `rule`, which count mistakes.
     threshold: float | None = None
-    #: Sharing of goals: by all branches of a `tree` (the paper), or not at all, as each `branch` draws its own;
-    #: `agent`: as the agent was trained.
+    #: Whether branches share goals. `tree`: all branches of a tree do (the paper); `branch`: each draws its own;
+    #: and with `agent` they do as in the agent's training.
     goals: Goals = "agent"
-    #: Share of the variance of an agent's draws that is drawn once for a whole rollout, as drivers differ in pace; 0:
-    #: every step draws anew.
+    #: Share of the variance of an agent's random numbers that is drawn once per rollout, so that some agents are fast
+    #: throughout and others slow; 0: every step draws anew.
     pace: Annotated[float, Bounds(0, 1)] = 0.0
     seed: int = 0  # Seed of everything that is drawn at random in the rollouts.
     device: str = "cpu"  # Device that simulates: `cpu`, `cuda` or `cuda:N`.
@@ -99,8 +99,8 @@ class EvaluateConfig(SimulationConfig):
     """Settings of an evaluation."""
 
     rollouts: Count = 16  # Rollouts of each run segment.
-    #: Search trees per run segment, each with goals of its own; each gives its share of the rollouts. If those are
-    #: fewer than its branches, use `--goals tree`: with goals of branches, the score would choose among goals, too.
+    #: Search trees per run segment, each with its own goals; each gives an equal share of the rollouts. If a tree has
+    #: more branches than it gives rollouts, use `--goals tree`; otherwise the score would also choose among goals.
     trees: Count = 1
     logged_goals: bool = False  # Give agents the routes of the log instead of sampled ones.
     #: Seconds of each run segment that are simulated; 0: as many as the agent was trained with.
@@ -109,7 +109,8 @@ class EvaluateConfig(SimulationConfig):
     #: with fewer); 0: as many as it was trained with (2 for the baselines). `all`: every vehicle that moves or stands
     #: in a lane, in open traffic.
     interactive: int | Literal["all"] = 0
-    #: Metres from the ego within which vehicles beyond the first two must come in the log to be driven; 0: no limit.
+    #: Drive vehicles beyond the first two only if they come within this many metres of the ego in the log; 0: no
+    #: limit.
     radius: NotNegative = 0.0
     #: Vehicles enter where the log brings them in and leave at the edge of the map, as they do with `all`; otherwise
     #: the same agents are driven from the first step to the last.
@@ -118,12 +119,12 @@ class EvaluateConfig(SimulationConfig):
     #: log) or the agent itself (`learned`). They are not evaluated; traffic is open for all but the log.
     others: Others = "log"
     metric: Annotated[tuple[str, ...], Fixed, Suppress] = ()  # Import paths of metrics of your own.
-    #: Run segments simulated at a time (changes memory, speed and rounding); 0: up to 64, or 16 with a planner, on
-    #: a card up to 1 024, four times as many going back, fewer where their agents see many points.
+    #: Run segments simulated at a time (changes memory, speed and rounding); 0: at most 64 (1 024 on a GPU, 16 with a
+    #: planner), fewer where agents see many points, and four times as many with `--search backtrack`.
     batch: Natural = 0
     #: Engine that runs the worker processes: `local`, or `ray`, on the cluster at RAY_ADDRESS or one started here.
     engine: Engine = "local"
-    #: Compile the steps of simulations, which takes minutes: `auto`, on a device where a run is long enough to win.
+    #: Compile the steps of simulations, which takes minutes; `auto`: only on a GPU, if a run is long enough.
     compile: Compile = "auto"
 
     def __post_init__(self) -> None:
@@ -149,8 +150,8 @@ class SimulateConfig(EvaluateConfig):
     #: Seconds of green, amber and all red of each phase of the traffic lights past the end of the log; by default
     #: they keep the cycle that the log shows, or take 25, 3 and 2.
     lights: tuple[float, ...] = ()
-    #: What becomes of agents whose boxes overlap: they `go-on`, `stop` for as long as they overlap, or are gone from
-    #: the next step on (`remove`), or until there is room where they came from (`respawn`).
+    #: What happens to agents whose boxes overlap. `go-on`: nothing; `stop`: they stand still while they overlap;
+    #: with `remove` they are gone from the next step on, with `respawn` until there is room where they began.
     after_collision: AfterCollision = "go-on"
 
     def __post_init__(self) -> None:
@@ -172,8 +173,8 @@ class WosacSettings(SimulationConfig):
     #: Score that a search lowers. `agent`: as is best for the agent; `discriminator`: what its own one calls unreal;
     #: `rule`: collisions, also those within half a second if all keep speed and course, and time off the road.
     score: WosacScore = "agent"
-    #: Share of the variance of an agent's draws that is drawn once for a whole rollout, as drivers differ in pace; 0:
-    #: every step draws anew. That of logged drivers is .17 (simulated towns) and .32 (NGSIM).
+    #: Share of the variance of an agent's random numbers that is drawn once per rollout, so that some agents are fast
+    #: throughout and others slow; 0: every step draws anew. Logged drivers have .17 (simulated towns) or .32 (NGSIM).
     pace: Annotated[float, Bounds(0, 1)] = 0.25
     #: Give agents the routes of the log instead of sampled ones; for the score only, since it tells them the future.
     logged_goals: bool = False

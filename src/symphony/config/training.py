@@ -97,8 +97,8 @@ class RunConfig(Settings):
     out: Path  # Folder of the run: configuration, metrics, checkpoints.
     steps: Count = 3000  # Updates of the networks (the paper: 70 000).
     seed: Annotated[int, Bounds(-MAX_SEED, MAX_SEED)] = 0  # Seed of the weights and of the order of the data.
-    #: Folder of a run whose networks training starts from, its best checkpoint if it was validated, else its
-    #: last (`RUN@last` or `RUN@3000` names another), or `pretrained:NAME`; new ones where that run has none.
+    #: Run whose networks training starts from, or `pretrained:NAME`: its best checkpoint if it was validated, else
+    #: its last (`RUN@last` or `RUN@3000` names another). A network that this run lacks starts anew.
     warm_start: Path | None = None
     #: Choice of the best checkpoint: that with the lowest collision rate plus off-road time (the paper).
     validation: ValidationConfig = field(default_factory=ValidationConfig)
@@ -112,7 +112,7 @@ class RunConfig(Settings):
     #: and WANDB_TAGS name project, group and tags.
     wandb: Literal["offline", "online", "disabled"] = "offline"
     device: str = "cpu"  # Device to train on: `cpu`, `cuda` or `cuda:N`.
-    #: Compile the steps of searches and of MGAIL, which takes minutes: `auto`, on a device if a run is long enough.
+    #: Compile the steps of searches and of MGAIL, which takes minutes; `auto`: only on a GPU, if a run is long.
     compile: Compile = "auto"
 
 
@@ -120,8 +120,8 @@ class RunConfig(Settings):
 class TrainConfig(RunConfig):
     """All settings of a training."""
 
-    #: Method to train: behavioural cloning or MGAIL, with goals (h), with tree search (ts), with both; with `rl`:
-    #: cloning and a policy gradient against collisions in closed loop, for an agent that drives (--warm-start).
+    #: Method to train: behavioural cloning (bc) or MGAIL, with goals (h), tree search (ts) or both; `rl` adds to
+    #: cloning a policy gradient against collisions in closed loop, for an agent that already drives (--warm-start).
     method: Positional[Method]
     #: Seconds of each run segment that are used (the paper: 10 and 20; 0: all there are).
     duration: Natural = 0

@@ -189,7 +189,7 @@ def convert(
         exclude_overlaps: leave out segments in whose log boxes overlap (see :mod:`symphony.data.overlaps`).
         radius: metres around the ego's path that are kept, of map and agents; None for all.
         hold_lights: give lights the last state that the log knows (before the first: the first) where it knows none.
-        strict: skip a record of which something odd would be left out (see :mod:`symphony.data.odd`).
+        strict: skip a record of which something odd would be left out or filled in (see :mod:`symphony.data.odd`).
         reader_options: arguments of the reader.
         workers: processes that convert files (see :func:`symphony.parallel.ordered_map`), for the same result.
         engine: where they are; with Ray, all machines must share the file system of ``files`` and ``out``.

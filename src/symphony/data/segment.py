@@ -208,8 +208,8 @@ class RunSegment:
     #: x, y where the ego is to come past, which its log does not show (a planning problem of CommonRoad). A store
     #: keeps it as a tag. Part of the content hash where there is one.
     goal: list[float] | None = field(default=None, metadata={"hashed": "given"})
-    #: steps of the log where the segment goes on past it (:mod:`symphony.rollouts.onward`); 0 where all are. Not part
-    #: of the content hash, and never in a store.
+    #: number of logged steps, if the segment goes on past its log (:mod:`symphony.rollouts.onward`); 0 if all steps
+    #: are logged. Not part of the content hash, and never in a store.
     logged: int = field(default=0, metadata={"hashed": False})
 
     @property

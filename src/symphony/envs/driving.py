@@ -62,7 +62,7 @@ class DrivingEnv(EnvBase):
     the state of the interactive agents and the routes they follow. The environment holds only constants, so forking a
     branch is an index and one instance serves every batch shape. Where the scenes say where their maps end, traffic
     is open: agents enter where the log brings them in, once there is room for them (they wait beside the road), and
-    leave at the edge of the map; absent agents are not ``valid``. An episode ends at the last logged step
+    leave at the edge of the map; absent agents are not ``valid``. An episode ends at the last step of its scene
     (``truncated``), or at what ``ends_on`` names (``terminated``). An action that is not finite leaves its agent
     nowhere, which also ends the episode (``terminated``), so that no step waits for a device. Simulations with an
     agent's networks raise an error at their end that names agent and step (:class:`NotFiniteError`).

@@ -96,8 +96,8 @@ def objects_at(
     index: Int[Tensor, "M N"],
     index_valid: Bool[Tensor, "M N"],
 ) -> Objects:
-    """Return the agents of each row's scene at a logged step (past the end of the log none is valid): log playback,
-    in which simulated agents that are real replace the rows ``index``.
+    """Return the agents of each row's scene at a logged step: as logged (past the end of the log none is valid), but
+    in the rows ``index`` the simulated agents, where ``index_valid``.
     """
     steps, agents = scenes.log_valid.shape[1:]
     row = scene * steps + step.clamp(max=steps - 1)
@@ -168,11 +168,11 @@ def rollout_heights(
 def entering(
     objects: Objects, index: Int[Tensor, "M N"], ready: Bool[Tensor, "M N"], late: Bool[Tensor, "M N"] | None = None
 ) -> Bool[Tensor, "M N"]:
-    """Return which of the ready agents can enter, far enough from all others: farther where they come ``late``, past
-    the log, where no log shows that it went well.
+    """Return which of the ready agents are far enough from all others to enter. Those that come ``late``, past the
+    log, must be farther away, as no log shows that it went well.
 
-    Of several that are ready the earlier slot goes first: a later one keeps away from it, even if that can't enter.
-    Those that are ready stand among ``objects`` where they enter; ``index`` are the driven agents' rows of A.
+    Of several that are ready the earlier slot goes first; a later one keeps away from it even if it can't enter.
+    In ``objects``, ready agents are where they would enter; ``index`` are the driven agents' rows of A.
     """
     agents = objects.valid.shape[1]
     slot = torch.arange(index.shape[1], device=index.device).expand(index.shape)

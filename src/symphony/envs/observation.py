@@ -28,8 +28,8 @@ _DISTANCES = 1 << 16  # distances held at a time
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """The extent of an agent's observation, and how it is scaled to numbers near one. What is not asked for is
-    neither computed nor an entry of a step: simulation without observation costs a fraction.
+    """The extent of an agent's observation, and how it is scaled to numbers near one.
+    What is not asked for is neither computed nor an entry of a step, which makes a simulation much cheaper.
     """
 
     num_objects: int = 16  # nearest agents kept; 0 for no entries of objects
@@ -95,7 +95,7 @@ def observe(
 ) -> dict[str, Tensor]:
     """Return what agents ``index`` among ``objects`` observe, by the last part of its key (see :mod:`symphony.keys`).
 
-    Of itself an agent observes speed, length, width and whether the last logged step is reached (0 or 1); masked
+    Of itself an agent observes speed, length, width and whether its scene is at the last step (0 or 1); masked
     entries are zero, and what was not asked for is left out. Nearness is the distance between centres. Lanes share
     their end points, so ties are common: on the CPU they go to the elements that come first, whatever the padding,
     and elements are in the order of the scene.

@@ -197,8 +197,8 @@ def _party(world: World, row: Indices, other: Indices, found: Contacts) -> _Part
 
 
 def _face(me: _Party, it: _Party) -> Indices:
-    """Return the side [E] with which each agent touches: that whose normal parts the boxes last, or of a corner that
-    meets the other's side, its end. One that is beside only the last :data:`CORNER` before the front touches with it.
+    """Return the side [E] with which each agent touches: the one whose normal separated the boxes last. A corner that
+    hits the other's side counts as front or rear, and the last :data:`CORNER` metres of a flank count as front.
     """
     away = from_numpy(it.position - me.position)
     pair = relation(away[:, 0], away[:, 1], from_numpy(me.heading), from_numpy(it.heading))

@@ -39,9 +39,9 @@ Record = dict[str, Any]
 
 
 def run_score(run: Mapping[str, Any]) -> float | None:
-    """Return 0 to 100 for a run: the progress relative to the log's, at most all of it; 0 for one that failed, with a
-    collision at fault, a red light, or time off the road. 100 where the log stays in place, as there is no progress
-    to make; None where progress is not defined: beyond a route that ends inside the map, without a route or a log.
+    """Return the score of a run: its progress in percent of the log's, from 0 to 100. It is 0 if the run failed or
+    has a collision at fault, a red light or time off the road, and 100 where the log stays in place, with no progress
+    to make. None where progress is undefined: beyond a route that ends inside the map, without a route or a log.
     """
     if run["failed"] or run["at_fault_collision"] or run["red_lights"] or run["offroad_time"]:
         return 0.0
@@ -153,8 +153,8 @@ def _scores(record: Record) -> dict[str, float | None]:
 def winners(records: Sequence[Record]) -> list[str]:
     """Say for each crowd which planner scores best, and by how much over the next one.
 
-    The difference is paired over the runs of the segments that both drove (± standard error over groups); whether 0
-    is outside of its 95 % interval is by Student's t. The better of two is the one that did better where both drove.
+    The difference is paired over the segments that both drove (± standard error over groups), and decides which of
+    the two is better. It is a win if its 95 % interval, by Student's t, does not include 0.
     """
     found = []
     for crowd, members in _crowds(records).items():

@@ -164,7 +164,7 @@ def read_evaluation(file: Path) -> dict[str, Any]:
 
 
 def fitting(kept: Iterable[str], patterns: Sequence[str]) -> list[str]:
-    """Return the names that the first fitting pattern fits (``*`` and ``?`` stand for anything); all without any."""
+    """Return the names that match the first pattern that any matches (with ``*`` and ``?``); all without patterns."""
     found = ([name for name in kept if fnmatchcase(name, pattern)] for pattern in patterns or "*")
     return next((names for names in found if names), [])
 

@@ -89,9 +89,9 @@ def collect(
 ) -> tuple[list[Entry], dict[str, list[Path]]]:
     """Return the evaluated runs of a setting, and the runs that are left out by the reason.
 
-    Of the evaluations whose names (``*`` is anything) fit some patterns those that the first one fits count. Raises a
-    :class:`ConfigError` for no runs, two of one method and seed, or two evaluations of one of them in one way to
-    simulate, a :class:`DataError` where a file can't be read.
+    With ``patterns`` (``*`` is anything), only evaluations count whose names match the first pattern that any
+    matches. Raises a :class:`ConfigError` for no runs, two runs of one method and seed, or two evaluations of a run
+    that were simulated in one way, a :class:`DataError` where a file can't be read.
     """
     entries, runs = dict[tuple[str, str, int], Entry](), dict[tuple[str, int], Path]()
     left_out: dict[str, list[Path]] = {}

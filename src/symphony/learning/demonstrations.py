@@ -296,8 +296,8 @@ class SceneDataset:
         return expert_batch(self._placed(tuple(items), device), *where, observation, action=action, routes=routes)
 
     def goal_updates(self, most: int, processes: int = 1) -> int:
-        """Return after how many updates the goal policy has learned from each agent ``PASSES`` times, or ``most``. An
-        agent chooses one route, so soon after that the choices of few are learned by heart.
+        """Return after how many updates the goal policy has learned from each agent ``PASSES`` times, at most
+        ``most``. Soon after that, it would know the choices of few agents by heart, as each chooses just one route.
         """
         return min(most, -(-PASSES * int(self.store.num_agents[self.indices].sum()) // (GOALS * processes)))
 

@@ -40,9 +40,9 @@ PRICE = 60.0
 class SearchReplay:
     """The last search and the batches that are drawn from it until the next.
 
-    Where the collector has the rows of K searches, these are made together, at every update that K x `every` divides,
-    by the networks of that update, and updates learn from one after the other: with the k-th of them (from 0) from
-    states that are k x `every` to (k + 1) x `every` - 1 updates old. K = 1 learns as from searches made when needed.
+    If the collector has the rows of K searches, these are made together, at every multiple of K x `every` updates, by
+    the networks of that update. Updates then learn from one search after the other: the states of search k (from 0)
+    are k x `every` to (k + 1) x `every` - 1 updates old. With K = 1 every search is made when it is needed.
 
     Not one of TorchRL's replay buffers: a state names a row of the scenes that its search drew, so it ends with them,
     and what networks observe is made only for the states drawn.

@@ -55,8 +55,8 @@ class Divergence(NamedTuple):
 def sampled_divergence(counts: NDArray[Any], counts_log: NDArray[Any]) -> Divergence:
     """Return the Jensen-Shannon divergence of sums of n independent samples, its error and bias by leaving one out.
 
-    Samples are drawn as pairs: of segments that are alike in rollouts and log less is sampling than of others, and
-    rollouts that are alike count as what they are.
+    A sample is left out with its rollouts and its log together. So noise that the two have in common is not counted
+    as bias, and rollouts of a sample that are alike are not taken for independent ones.
 
     Takes the histograms [n, K] of rollouts and log of each sample (a recording, or a segment). Source: Quenouille,
     "Notes on bias in estimation", Biometrika 43 (1956).

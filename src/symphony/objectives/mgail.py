@@ -27,8 +27,8 @@ gradient vanishes where D is sure of the simulation; -log(1 - D), where D is sur
 
 
 class MGAILLoss(MaskedLoss):
-    """Adversarial loss of an actor: how simulated its states look, with gradient through the dynamics (paper, III-C;
-    Baram et al. 2017).
+    """Adversarial loss of an actor: how simulated its states look, with gradient through the dynamics.
+    Sources: the paper, III-C; Baram et al. 2017.
 
     The loss simulates from the states it is given, by the actor's reparameterised draws, and averages a cost of the
     discriminator's logit over all steps and agents. Only the actor receives a gradient. With given random numbers it

@@ -22,11 +22,11 @@ _PLACE = re.compile(" at 0x[0-9A-Fa-f]+")
 
 
 def source_of(planner: str | Callable[..., Any]) -> str:
-    """Return a digest of the code that a planner is made of, as far as its name tells, and of what was bound to it:
-    by ``functools.partial``, as an object's attributes, by the function around it.
+    """Return a digest of the file that a planner is written in, and of the values bound to it: by
+    ``functools.partial``, as attributes of an object, or as variables of an enclosing function.
 
-    For a command it is that of the program it starts, if that is a file, and of the first other word that is one.
-    Empty for what comes with the package, and where no source is known.
+    For a command, it covers the program that is started, if that is a file, and the first other word that is a file.
+    It is empty for planners that come with the package, and where no source is known.
     """
     if isinstance(planner, str) and planner.startswith(PIPE):
         words = shlex.split(planner.removeprefix(PIPE))

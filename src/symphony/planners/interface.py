@@ -154,10 +154,10 @@ class Planner(Protocol):
     A class may also have a class method ``plan_batch(planners, traffics)``: it takes all its planners of a batch of
     rollouts and what each of them sees, lists of one length, and returns as many plans. Then ``plan`` is not called.
 
-    A search forks planners by ``copy.deepcopy``; one that can't be copied drives with ``--search none``. A copy draws
-    the same random numbers as the one it was made of, if it draws them as :attr:`Scenario.seed` says. One that raises
-    an exception, or returns what is not finite, of another length or a target farther away than :data:`MAX_SPEED`
-    allows, makes its run a failed one; the run's later steps don't count.
+    A search forks planners by ``copy.deepcopy``; a planner that can't be copied needs ``--search none``. A copy draws
+    the same random numbers as its original, if these come from :attr:`Scenario.seed`. The run fails, and its later
+    steps don't count, if the planner raises an exception or returns numbers that are not finite, a plan of another
+    length, or a target farther away than :data:`MAX_SPEED` allows.
     """
 
     def reset(self, scenario: Scenario) -> None:
@@ -165,8 +165,8 @@ class Planner(Protocol):
         ...
 
     def plan(self, traffic: Traffic) -> Pose | Control | Sequence[float] | Sequence[Pose] | NDArray[Any]:
-        """Return the plan of the ego until the next step: 4 numbers are a :class:`Pose`, 2 a :class:`Control`. Of
-        several targets, a trajectory a step apart, the first is where the ego goes; then it is asked again.
+        """Return the plan of the ego until the next step: 4 numbers are a :class:`Pose`, 2 a :class:`Control`. Of a
+        trajectory (several poses, one step apart) the ego goes to the first; then the planner is asked again.
         """
         ...
 

@@ -12,7 +12,6 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from symphony.data.segment import wrap
 from symphony.errors import DataError
 
 Reals = NDArray[np.float64]
@@ -84,7 +83,7 @@ def line_strings(lines: Sequence[Reals]) -> NDArray[Any]:
 
 def turn_between(a: Reals, b: Reals) -> Reals:
     """Return the absolute difference of two headings, in [0, pi]."""
-    return np.abs(wrap(a - b))
+    return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi)
 
 
 BIKE_LANE = 3  # the lane type that vehicles keep off (see ``LaneType``)
@@ -143,7 +142,7 @@ class LaneGraph:
         self.right = self._adjacency(road.right_neighbors, "road.right_neighbors")
         headings = [np.arctan2(*np.diff(line, axis=0).T[::-1]) for line in self.lines]
         self.start_heading = np.array([heading[0] if len(heading) else 0 for heading in headings], np.float64)
-        turns = [wrap(np.diff(heading)).sum() for heading in headings]
+        turns = [((np.diff(heading) + np.pi) % (2 * np.pi) - np.pi).sum() for heading in headings]
         self.curvature: Reals = np.array(turns, dtype=np.float64) / np.where(self.length > 0, self.length, 1)
         self.regions = self._branching()
         self.followed: dict[tuple[int, int], Reals] = {}

@@ -263,8 +263,8 @@ def route_lines(
 def carried_on(graph: LaneGraph, line: Reals, length: float, speed: float = 0.0) -> Reals | None:
     """Return a line [P, 2] that ends beside lanes that go on, carried on up to a length in metres; None for others.
 
-    On that lane, :func:`change_length` or :data:`CHANGE_METRES` before its end, it changes to the nearest of those,
-    and follows the straightest lanes from there, again and again where these end beside others, too.
+    Within the last :func:`change_length` of that lane it changes to the nearest of those, over at least
+    :data:`CHANGE_METRES`, and follows the straightest lanes from there, again and again where these end beside others.
     """
     drops, found = list(graph.drops), None
     ends = np.array([graph.lines[lane][-1] for lane in drops]).reshape(-1, 2)

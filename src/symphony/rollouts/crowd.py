@@ -36,12 +36,12 @@ PAIR = 2
 
 @dataclass(frozen=True)
 class Crowd:
-    """The choice of driven agents of a segment: at most a number that move, or all that move or stand in a lane.
-    Those beyond :data:`PAIR` must come within a radius of the ego in the log (metres; 0 for no limit). In open
-    traffic they enter and leave. Where there is a background, the other vehicles are driven, too, by a rule, up to
-    :data:`MOST` with these; along routes, vehicles that are on no lane play back the log. Those ``also`` driven, by
-    ids, come after the ego, beside the others. ``onward`` says how traffic goes on where the log ends before the
-    duration: the agent drives those that enter then if it drives all, else the background's rule; else none enter.
+    """Which agents of a segment are driven: at most ``count`` that move or, with ``everyone``, also stand in a lane.
+    Those beyond the first two must come within ``radius`` metres of the ego in the log (0 for no limit). In open
+    traffic they enter and leave. With a ``background``, a rule drives the other vehicles, up to :data:`MOST` agents
+    in all; with ``along_routes``, vehicles that are on no lane play back the log instead. Ids in ``also`` are driven
+    in addition, right after the ego. ``onward`` says how traffic goes on if the log is too short: vehicles enter only
+    if the agent drives everyone, these included, or a background's rule drives them.
     """
 
     count: int
@@ -60,7 +60,7 @@ class Crowd:
         those that stand in a lane, by their distance; in open traffic then later ones, by time, then distance.
 
         Raises:
-            DataError: the ego or one of those is not seen at the first step, or in open traffic never within the map.
+            DataError: the ego or one of those is not seen at the first step, or the ego, in open traffic, never on the map.
         """
         there = segment.valid
         if self.open_traffic:
@@ -151,9 +151,9 @@ def crowd_dataset(
     routes: bool = False,
     also: Sequence[int] = (),
 ) -> CrowdDataset:
-    """Return the scenes that a configuration asks for, of all or some rows of a store; a :class:`DataWarning` if its
-    generation is not finished. Where the configuration leaves that open, there are ``default`` interactive agents, or
-    as many as the agent was trained with; ``routes``: also for an agent that follows none; ``also``: see Crowd.
+    """Return the scenes that a configuration asks for, of all or some rows of a store; a :class:`DataWarning` says if
+    the store is unfinished. The number of interactive agents, if the configuration leaves it open, is ``default`` or
+    that of training. ``routes`` asks for routes even if the agent follows none; ``also`` is as for :class:`Crowd`.
     """
     if store.unfinished is not None:
         warnings.warn(f"{store.path} {store.unfinished}", DataWarning, stacklevel=2)

@@ -97,7 +97,7 @@ def simulation(
     # Beside log playback there are only planners: any policy will do, as its actions are not used.
     policy = ConstantVelocity(Bicycle()) if agent.policy is None else agent.policy
     if agent.policy is None and int((scenes.interactive_valid & ~scenes.background).sum(1).amax()) > len(egos):
-        raise ConfigError("beside log playback those with a planner are the only interactive agents")
+        raise ConfigError("beside log playback, every interactive agent must have a planner")
     agent.check_step(float(scenes.dt[0]))
     compiled, plan = config.compile == "yes", agent.plan(config)
     if egos and (plan.kind == "backtrack" or compiled):
@@ -153,7 +153,7 @@ class _Goals(NamedTuple):
     scenes: SceneBatch
     config: EvaluateConfig
     given: Int[Tensor, "B N"] | None
-    planned: int  # how many of the first agents are
+    planned: int  # number of first agents that have a planner
 
     def start(self, plan: SearchPlan) -> TensorDictBase:
         """Return the first states [B, trees, S]."""
@@ -169,8 +169,8 @@ class _Goals(NamedTuple):
         )
 
     def fixed(self, row: Int[Tensor, "*b"], goal: Int[Tensor, "*b N"]) -> Int[Tensor, "*b N"]:
-        """Return the goals that agents follow in rows of the scenes instead of drawn ones: the first ones, which are
-        planned, and background agents that IDM drives those of the log, others those that are given.
+        """Return drawn goals of some rows of the scenes, with those replaced that are fixed: agents with a planner,
+        and background agents that the IDM drives, follow the routes of the log, others the goals given for them.
         """
         followed = self.scenes.route_logged[row]
         if self.given is not None:
@@ -227,7 +227,7 @@ def _searched(
     ends = result.trajectories[..., -1]  # a copy of a branch follows the goals of its parent
     found, goal = rollouts_of(env, start, result.trajectories), ends.get(keys.GOAL)
     if plan.kind == "backtrack":
-        # Lines are trees of one branch each; to be filled from each other they are the branches of one.
+        # So far each line is a tree of one branch. As branches of one tree, good lines can replace bad ones.
         begun = result.alive.squeeze(-2)[..., :: result.prune_every]
         # What follows an end is never bad.
         totals = torch.where(begun, result.totals.squeeze(-1), -torch.inf)
@@ -269,7 +269,7 @@ def _check_given(agent: Agent, config: EvaluateConfig, given: Int[Tensor, "B N"]
 
 
 def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Simulation:
-    """Exclude the steps after a planner, numbers [B, K, P], failed."""
+    """Return a simulation without the steps after a planner failed, given the numbers [B, K, P] of the planners."""
     each, steps = [planned.failures(row) for row in number], found.rollouts.counted.shape[-2]
     until = [[steps if one is None else one.step for one in row] for row in each]
     going = torch.arange(steps, device=number.device) < torch.tensor(until, device=number.device)[..., None]
@@ -280,8 +280,8 @@ def _without_failed(found: Simulation, planned: EgoPolicy, number: Tensor) -> Si
 
 
 def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
-    """Return the configuration beside a planner of the ego: without a search unless one is asked for, as a search
-    asks the planner once for each branch; else in trees of a few branches, which all count, given enough rollouts.
+    """Return the configuration for a simulation with a planner of the ego. There is no search unless asked for,
+    as every branch calls the planner; if so, trees have few branches, all of which count, given enough rollouts.
     """
     kind: Search = "tree" if config.branches or config.trees > 1 else "none"
     compiled: Compile = "no" if config.compile == "auto" else config.compile
@@ -296,9 +296,9 @@ def beside_planner(config: EvaluateConfig) -> EvaluateConfig:
 def spread_runs(
     agent: Agent, config: EvaluateConfig, runs: int, segments: int, *, planned: bool = False
 ) -> tuple[int, EvaluateConfig]:
-    """Return how many of the run segments give ``runs`` runs together (a few more if they can't be divided), and the
-    configuration with as few rollouts of each as that takes: segments are the independent samples. Where branches
-    cost calls of a planner, there are no more trees, and so no more segments, than the runs need as leaves.
+    """Return how many run segments give ``runs`` runs together (a few more if they can't be divided), and the
+    configuration with the rollouts of each: as few as possible, since segments are the independent samples. Where
+    branches call a planner, there are only as many trees, and so segments, as the runs need as leaves.
     """
     plan = agent.plan(dataclasses.replace(config, rollouts=config.trees))
     whole_trees = planned and plan.kind == "tree"
@@ -319,8 +319,8 @@ def spread_runs(
 
 
 def filled_lines(totals: Float[Tensor, "B K P"], threshold: float) -> Int[Tensor, "B K"]:
-    """Return which line stands in each place after backtracking: its own, but a good one of its scene where it stayed
-    bad, with the total of some period above the threshold. The places of bad lines take the good ones in turn.
+    """Return which line fills each place after backtracking. A line stayed bad if the total of some period is above
+    the threshold; good lines of its scene take its place, in turn. Without a good one all lines stay in their places.
     """
     good = (totals <= threshold).all(-1)
     count, place = good.sum(-1, keepdim=True), torch.arange(good.shape[-1], device=good.device)

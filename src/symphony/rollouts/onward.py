@@ -47,12 +47,12 @@ class Onward:
     def extended(self, segment: RunSegment, graph: LaneGraph, steps: int, *, enter: bool = True) -> RunSegment:
         """Return a segment of U ``steps``, the first T of which are those of the log (``logged``).
 
-        Past them agents that stood where they were all along still stand there, and no others are seen: they leave,
-        or are driven. Vehicles that ``enter`` are rows after those of the log, seen once: where and when they
-        may first enter, each step and lane a Bernoulli draw of its own. Their sizes are those of vehicles of the log,
-        their speeds those of vehicles that came in by their lane, or on the map. All is drawn from seed and segment,
-        so that planners that are compared meet the same demand. Rollouts meet it, too: they share the rows of their
-        scene, and demand of their own would take as many times the rows, of which everyone is compared with all.
+        After the log, only agents that stood in one place throughout are seen, at that place; all others leave or are
+        driven. With ``enter``, new vehicles become rows after those of the log. Each is valid at a single step: where
+        and when it may first enter, by a Bernoulli draw for every step and lane. Its size is that of a logged
+        vehicle, its speed that of one that came in by the same lane, or drives on the map. All is drawn from seed and
+        segment, so that planners that are compared meet the same demand. So do rollouts: they share the rows of their
+        scene, as all rows are compared with each other, and demand of their own would multiply them.
 
         Raises:
             DataError: more than :data:`MOST_ENTER` vehicles would enter, or there would be more than can be kept.

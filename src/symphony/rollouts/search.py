@@ -85,8 +85,8 @@ def no_value(state: TensorDictBase) -> Float[Tensor, "*b"]:
 
 
 def rule_score(env: DrivingEnv, state: TensorDictBase) -> Float[Tensor, "*b N"]:
-    """Return the score [..., N] of a rule: 1 where an agent collides, is off the road, or would :data:`AHEAD`
-    later, observed or not, if all kept speed and course.
+    """Return the score [..., N] of a rule: 1 where an agent collides, is off the road, or would collide
+    :data:`AHEAD` later, also with agents that it does not observe, if all kept speed and course.
     """
     there, row = state.get(keys.VALID), state.get(keys.SCENE).flatten()
     moves, real = (state.get(key).flatten(0, state.ndim - 1) for key in (keys.STATE, keys.VALID))
@@ -189,8 +189,8 @@ def search(
     value: Callable[[TensorDictBase], Tensor] | None = None,
     **returned: Any,
 ) -> BeamSearchResult:
-    """Run a beam search from a start state [..., S], all branches of a tree, to the last logged step. Other scenes of
-    the batch change nothing.
+    """Run a beam search from a start state [..., S], all branches of a tree, to the last step of the longest scene.
+    Other scenes of the batch change nothing.
 
     It prunes every T_p steps by :func:`realism_score`, or by a ``value`` of states alone. It keeps of every step what
     it takes to observe its states again, and what is named in ``also``; ``returned`` are settings of

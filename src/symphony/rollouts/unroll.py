@@ -30,9 +30,9 @@ _NEVER = 1 << 30
 
 
 class Rollouts(NamedTuple):
-    """Rollouts of the interactive agents: states x, y, heading, speed, the first one included; collisions (see
-    :func:`between_states` for those between states) and time off the road after each of T steps; and which of these
-    are evaluated: of real agents while they are present, up to the segment's last logged step.
+    """Rollouts of the interactive agents: states x, y, heading, speed, the first one included; flags, after each of T
+    steps, of collisions (see :func:`between_states` for those between states) and of being off the road; and which
+    steps are evaluated: those of real agents while they are present, up to the segment's last logged step.
     """
 
     state: Float[Tensor, "*b T+1 N 4"]
@@ -52,10 +52,10 @@ def simulate(
     start: TensorDictBase,
     steps: int | None = None,
 ) -> Rollouts:
-    """Roll a policy, which writes the action, out from a start state of :meth:`DrivingEnv.start` of any batch shape,
-    at least one step, by default up to the last logged step of the longest scene.
+    """Simulate a policy, which writes the actions, from a start state, and return states and flags.
 
-    Only states and flags are kept: the observations of sixteen rollouts would take gigabytes.
+    The start is made by :meth:`DrivingEnv.start`, in any batch shape. At least one step is simulated, by default all
+    of the longest scene's log. Observations are not kept, as those of sixteen rollouts would take gigabytes.
     """
     steps = env.decisions if steps is None else steps
     now, states, collisions, offroads, there = start, [start.get(keys.STATE)], [], [], []
@@ -186,7 +186,7 @@ def rollouts_of(env: DrivingEnv, start: TensorDictBase, trajectories: TensorDict
 
 
 def _counted(env: DrivingEnv, start: TensorDictBase, there: Tensor) -> Bool[Tensor, "*b T N"]:
-    """Return the steps after which agents are present [..., T, N] and their segment still has logged steps."""
+    """Return the steps after which agents are present [..., T, N] and their scene still has steps."""
     step = start.get(keys.STEP) + torch.arange(1, there.shape[-2] + 1, device=start.device)
     return (step <= env.scenes.last_step[start.get(keys.SCENE)])[..., None] & there
 
@@ -228,8 +228,8 @@ def between_states(
 
 
 class NotFiniteError(SymphonyError):
-    """A network returned a number that is not finite, first for some agent (the ego is 0) of a row of the scenes at
-    some step; comparisons with NaN would choose silently.
+    """A network returned a number that is not finite, which would silently decide comparisons. The error names the
+    row of the scenes, the step and the agent (the ego is 0) where that happened first.
     """
 
     def __init__(self, what: str, row: int, step: int, agent: int, name: str = "") -> None:
@@ -248,9 +248,9 @@ class NotFiniteError(SymphonyError):
 
 
 class NaNGuard(TensorDictModuleBase):
-    """A module that remembers in which scenes, and when first, a guarded entry [*b, N, ...] that it wrote was not
-    finite for a valid agent; read once, at the end, so that no step waits for the device. One that scores sees the
-    last state of a scene, too; past a scene's end there is only padding.
+    """Wraps a module and remembers for each scene when a guarded entry [*b, N, ...] that it wrote was first not
+    finite for a valid agent. :meth:`check` reads that once, at the end, so that no step waits for the device. With
+    ``scores`` the last state of a scene counts, too; past a scene's end there is only padding.
     """
 
     def __init__(

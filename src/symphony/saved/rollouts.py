@@ -178,9 +178,9 @@ def saved_rollouts(
     failed: Mapping[int, str] | None = None,
     plan: NDArray[np.float32] | None = None,
 ) -> SavedRollouts:
-    """Return the rollouts [B, K, ...] of one run segment, in a row of B scenes, ready to be written; with the goals
-    [B, K, N], the search [B, R] of which they are the leaves, the driver of all interactive agents, or of each, who
-    drives the background agents (``others``), why rollouts failed, by number, and what planners meant (``plan``).
+    """Return the rollouts of one run segment, a row of the B scenes, ready to be written. Takes those of all scenes
+    [B, K, ...], their goals [B, K, N], the search [B, R] whose leaves they are, the driver of all interactive agents
+    or of each, that of background agents (``others``), why rollouts failed, by number, and planned paths (``plan``).
     """
     real, background = (_array(part[row]) for part in (scenes.interactive_valid, scenes.background))
     steps = min(segment.num_steps - 1, rollouts.collision.shape[-2])

@@ -44,13 +44,13 @@ def save_simulation(
     goals: Sequence[str] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RolloutFolder:
-    """Simulate an agent on every run segment of a dataset, which has routes if there are goals or a planner, and keep
-    the rollouts, and on demand all branches of the search, in a folder. An interrupted one goes on where it stopped.
+    """Simulate an agent on every run segment of a dataset and keep the rollouts in a folder, with ``keep_tree`` also
+    all branches of the search. An interrupted one continues. With goals or a planner the dataset must have routes.
 
-    A planner (see :func:`symphony.planners.interface.planner_maker`) drives the ego, others those that they are to
-    drive, by the ids that the dataset has ``also`` (:class:`symphony.rollouts.crowd.Crowd`), the agent the other
-    interactive agents, without a search unless one is asked for. More than ``planner_seconds`` for an answer fails
-    the run. Segments in which a planner has no agent to drive are recorded as failed. Goals are those of
+    The ``planner`` (see :func:`symphony.planners.interface.planner_maker`) drives the ego, those in ``drives`` the
+    agents with these ids, which the dataset must have ``also`` (:class:`symphony.rollouts.crowd.Crowd`), and the
+    agent all other interactive ones, without a search unless one is asked for. A run fails if an answer takes more
+    than ``planner_seconds``. Segments whose planner has no agent to drive are recorded as failed. Goals are as in
     :func:`symphony.rollouts.control.given_goals`. ``progress`` is called with the segments done and their total.
 
     Raises:

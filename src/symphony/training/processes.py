@@ -101,7 +101,7 @@ class Processes:
 
 @contextmanager
 def processes(device: torch.device) -> Iterator[Processes]:
-    """Give the processes that ``torchrun`` started or that have a group; else this one. ConfigError: no card."""
+    """Yield the processes that ``torchrun`` started or that form a group; else this one. ConfigError: no GPU."""
     begun = dist.is_available() and dist.is_initialized()
     own = dist.is_available() and not begun and dist.is_torchelastic_launched()
     if not own and not begun:
