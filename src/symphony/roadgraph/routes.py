@@ -264,7 +264,7 @@ def carried_on(graph: LaneGraph, line: Reals, length: float, speed: float = 0.0)
     """Return a line [P, 2] that ends beside lanes that go on, carried on up to a length in metres; None for others.
 
     Within the last :func:`change_length` of that lane it changes to the nearest of those, over at least
-    :data:`CHANGE_METRES`, and follows the straightest lanes from there, again and again where these end beside others.
+    :data:`CHANGE_METRES`, and follows the straightest lanes from there, again and again if they end beside others.
     """
     drops, found = list(graph.drops), None
     ends = np.array([graph.lines[lane][-1] for lane in drops]).reshape(-1, 2)
