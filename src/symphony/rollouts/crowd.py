@@ -60,7 +60,7 @@ class Crowd:
         those that stand in a lane, by their distance; in open traffic then later ones, by time, then distance.
 
         Raises:
-            DataError: the ego or one of those is not seen at the first step, or in open traffic the ego never on the map.
+            DataError: the ego or one of those is absent at first, or in open traffic the ego never on the map.
         """
         there = segment.valid
         if self.open_traffic:
