@@ -82,7 +82,7 @@ bench: $(DEV)  ## speed of everything, by part and as it grows, in CPU time of o
 	$(BIN)/python benchmarks/tables.py out/bench.json
 
 docs: $(DEV)  ## build the pages of docs/ into out/site; broken links are errors
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 format: $(DEV)  ## rewrite the files in the style that lint asks for
 	$(BIN)/ruff check --fix

@@ -11,6 +11,7 @@ import os
 import re
 import runpy
 import shlex
+import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -180,3 +181,8 @@ def test_docstrings_are_markdown_in_the_reference(site: Path) -> None:
     prose = re.sub(r'<span class="sd">.*?</span>', "", pages)  # without the sources that are shown
     assert re.findall(r"[^\n]*:(?:class|func|meth|data|mod|attr):[^\n]*", prose) == []
     assert "[*env.batch_size, T]" in pages  # not the beginning of an emphasis
+
+
+def test_the_pages_build(tmp_path: Path) -> None:
+    command = f"-m mkdocs build --strict --site-dir {tmp_path}"
+    subprocess.run([sys.executable, *command.split()], cwd=ROOT, check=True)

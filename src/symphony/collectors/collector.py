@@ -51,8 +51,8 @@ class BeamSearchCollector(Collector):
         keep_tree: also return the pruned branches; with ``leaves=branches`` only.
         rule_noise: ``rule_noise(start, periods)`` gives numbers in [0, 1) for rules that draw, as `noise` of
             :func:`beam_search`; by default from a generator that :meth:`set_seed` sets.
-        prune_every, rule, aggregate, value, accumulate, prune_last, until_done, slot_keys, group_key, keep,
-            compile_step: as for :func:`beam_search`.
+        prune_every, rule, aggregate, value, accumulate, prune_last: as for :func:`beam_search`.
+        until_done, slot_keys, group_key, keep, compile_step: as for :func:`beam_search`, too.
         kwargs: as for :class:`Collector`. `frames_per_batch` is rows x L x T, `simulated_frames` S / L times as many.
     """
 
