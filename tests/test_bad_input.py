@@ -21,6 +21,7 @@ from symphony.data.sources import get_reader, readers, womd
 from symphony.data.sources.base import Item
 from symphony.data.sources.commonroad import NO_LANELET, NO_LIGHT, NO_OBSTACLE
 from symphony.data.sources.lines import drivable_rings
+from symphony.data.sources.sumo.roads import read_network
 from symphony.data.sources.womd import masked_crc32c
 from symphony.errors import DataError
 
@@ -298,3 +299,10 @@ def test_womd_lists_without_end(field: str, tmp_path: Path, monkeypatch: pytest.
     entries.extend([entry] * 5001)  # type: ignore[attr-defined]
     sources.write_records(tmp_path / "a", [scenario.SerializeToString()])
     assert "entries, at most" in sources.read_error("womd", tmp_path / "a").message
+
+
+def test_places_to_walk_without_an_area_are_left_out(tmp_path: Path) -> None:
+    lanes = '<lane shape="1,1 2,2" allow="no"/>', '<lane shape="1,1 1,1" width="4" allow="no"/>'
+    text = '<net><edge id=":a" function="walkingarea">{}</edge><edge id=":b_0" function="crossing">{}</edge></net>'
+    (file := tmp_path / "x.net.xml").write_text(text.format(*lanes))
+    assert read_network(file).walked == read_network(file).crosswalks == []

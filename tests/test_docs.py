@@ -184,5 +184,6 @@ def test_docstrings_are_markdown_in_the_reference(site: Path) -> None:
 
 
 def test_the_pages_build(tmp_path: Path) -> None:
-    command = f"-m mkdocs build --strict --site-dir {tmp_path}"
-    subprocess.run([sys.executable, *command.split()], cwd=ROOT, check=True)
+    subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", tmp_path], cwd=ROOT, check=True
+    )

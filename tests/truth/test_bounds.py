@@ -88,11 +88,9 @@ def test_the_report_prints_dashes_counts_and_bounds(tmp_path, capsys):
     assert main(["report", str(tmp_path / "sim"), "--no-view", "--evaluated", "ego"]) == 0
     lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
     assert "0.00 (≤ 77.64)" in lines["collision_rate"]
-    for name, cell, segments in (("offroad_time", "0.00 (≤ 95.00)", 1), ("red_light_rate", "–", 0)):
-        assert cell in lines[name]
-        assert f"{segments} of 2 segments" in lines[name]
-    page = (tmp_path / "sim" / "report.html").read_text()
-    assert all(text in page for text in ("≤ 78", "of 1 segments"))
+    wanted = (("offroad_time", "0.00 (≤ 95.00)", 1), ("red_light_rate", "–", 0))
+    assert all(cell in lines[name] and f"{known} of 2 segments" in lines[name] for name, cell, known in wanted)
+    assert all(text in (tmp_path / "sim" / "report.html").read_text() for text in ("≤ 78", "of 1 segments"))
 
 
 def test_the_evaluator_knows_no_road_without_a_boundary(tmp_path: Path) -> None:

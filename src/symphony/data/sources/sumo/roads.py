@@ -116,9 +116,10 @@ def read_network(file: Path) -> Network:
             balance.update({element.attrib["to"]: 1})
         names.append(element.attrib["id"])
         if element.get("function") == "walkingarea":
-            walked += [shape(lane.attrib["shape"]) for lane in element.iter("lane")]
+            walked += [area for lane in element.iter("lane") if len(area := shape(lane.attrib["shape"])) > 2]
         if element.get("function") == "crossing":
-            crosswalks += [_across(shape(lane.attrib["shape"]), lane) for lane in element.iter("lane")]
+            lines = ((shape(lane.attrib["shape"]), float(lane.attrib["width"])) for lane in element.iter("lane"))
+            crosswalks += [_across(line, width) for line, width in lines if (line[0] != line[-1]).any()]
             crossed[element.attrib["id"][1:].rpartition("_")[0]] += 1
         # From right to left, which is the other way round where people drive on the left.
         own = list(filter(for_cars, element.iter("lane")))[::side]
@@ -204,10 +205,10 @@ class Crop:
     unwalked: Polygon | MultiPolygon  # the road, but for crosswalks and its edge
 
 
-def _across(line: Doubles, lane: ET.Element) -> Doubles:
+def _across(line: Doubles, width: float) -> Doubles:
     """Return the corners [4, 2] of a crosswalk."""
     along = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
-    aside = np.array([-along[1], along[0]]) * float(lane.attrib["width"]) / 2
+    aside = np.array([-along[1], along[0]]) * width / 2
     return np.stack([line[0] + aside, line[0] - aside, line[-1] - aside, line[-1] + aside])
 
 
