@@ -286,12 +286,13 @@ def ends(road: RoadMap) -> tuple[NDArray[Any], NDArray[Any]]:
 
 @needs_sumo
 def test_in_streets_cars_are_parked_and_people_cross_at_crosswalks(simulated: dict[str, list[RunSegment]]) -> None:
-    """The cars stand partly on lanes, and others pass them."""
     counts = np.zeros(5)
     for s in simulated["street-1"]:
         cars, people = s.agent_type == AgentType.VEHICLE, s.agent_type == AgentType.PEDESTRIAN
         moving = cars & (travel(s) > MOVING)
         assert s.size[moving, 1].max() < 2.0  # wider ones can not pass
+        away = np.linalg.norm(s.position[moving & s.valid.all(1), 0] - s.position[s.ego, 0], axis=-1)
+        assert (away < 40).sum() > 1  # the ego and another
         edges = shapely.union_all([shapely.linestrings(line[:, :2]) for line in s.road.boundary])
         on_road = s.size[:, 1] / 2 - shapely.distance(edges, shapely.points(s.position[:, 0, :2]))
         parked = cars & s.valid.all(1) & (np.ptp(s.position, axis=1).max(1) == 0) & (on_road > -0.3) & (on_road < 1.1)

@@ -317,8 +317,7 @@ def test_what_is_written_can_be_read_and_is_all_well(submission, tmp_path):
 
 def test_drafts_of_killed_processes_go_and_full_disks_are_told(tmp_path, monkeypatch):
     dead, lives = (tmp_path / f".x.tar.gz.{process}.abcd_1234" for process in (2**40, os.getppid()))
-    dead.mkdir(), lives.mkdir()
-    write_submission(ROLLOUTS.items(), META, out := tmp_path / "x.tar.gz", shards=1)
+    dead.mkdir(), lives.mkdir(), write_submission(ROLLOUTS.items(), META, out := tmp_path / "x.tar.gz", shards=1)
     assert {*tmp_path.iterdir()} == {lives, out}
     monkeypatch.setattr(submissions, "_pack", lambda *_: os.stat("/nowhere"))
     with pytest.raises(DataError, match=r"x\.tar\.gz: can't be written"):
