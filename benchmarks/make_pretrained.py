@@ -216,7 +216,8 @@ def _before(run: Path, config: TrainConfig) -> str:
     if not (folder / "config.json").is_file():
         return words
     earlier = read_run(folder)
-    further = _before(folder, earlier)
+    # An included agent may have gone on from the one that it replaces, of which nothing is left.
+    further = "" if earlier.warm_start == config.warm_start else _before(folder, earlier)
     origin = f", itself from {further}" if further else ""
     return f"{words} ({method_name(earlier.method)}, {_count(earlier.steps)} updates{origin})"
 

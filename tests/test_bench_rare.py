@@ -122,7 +122,7 @@ def test_near_is_whoever_is_ahead_and_a_hit_is_remembered() -> None:
 
 
 def test_the_command_finds_the_rate_of_free_rollouts_and_keeps_what_shows_it(tmp_path, capsys):
-    coast, agent, out = EXAMPLES / "coast.py", "pretrained:bc_ts_h", tmp_path / "out"
+    coast, agent, out = EXAMPLES / "coast.py", "random --interactive 4", tmp_path / "out"
     words = f"{agent} --planner {coast}:plan --data {brief(tmp_path / 'store', (2,), steps=51)}".split()
     kept = f"--metric collision_rate --trees 4 --branches 8 --out {out} --json -".split()
     assert main(["hunt", *words, *kept]) == 0

@@ -79,9 +79,6 @@ def test_the_floor_is_what_a_log_scores_against_what_it_was_drawn_from(segments:
     assert scored < np.mean([sampling_floor(log) for _, log in trials])
 
 
-# --- goals ---
-
-
 def arc(angle: float, points: int = 30) -> torch.Tensor:
     """A route that is straight, then turns by an angle to the left, then goes on."""
     heading = torch.zeros(points, dtype=torch.float64)

@@ -178,8 +178,6 @@ def test_info_counts_what_is_there(logs: Write, out: Path) -> None:
     assert (found["skipped"], found["exclusions"]["interactive_agents"]) == (2, 1)
 
 
-# --- several stores as one -----------------------------------------------------------------------------------
-
 PARTS = [builtin_store("train"), builtin_store("test")]
 
 
@@ -266,9 +264,6 @@ def test_the_same_segment_twice_another_time_step_and_what_is_there_are_refused(
         writer.write_report({"settings": {"segments": 9}, "generation": {"complete": False}})
     with pytest.raises(DataError, match=r"half: holds 1 of 9 segments"):
         merge([PARTS[1], tmp_path / "half"], tmp_path / "all")
-
-
-# --- cropping: what is near stays as it is, what is far goes ------------------------------------------------------
 
 
 @given(st.floats(5, 400), st.integers(0, 20))

@@ -18,11 +18,12 @@ from hypothesis import strategies as st
 
 from helpers_saved import played, searched
 from helpers_segments import LANE_WIDTH, crossing, crossing_road, make_road, make_segment, straight_road, turned
-from helpers_store import fill
+from helpers_store import brief, fill
 from helpers_table import make_entry, make_record, make_run
 from symphony.cli import main
 from symphony.config import METHODS
 from symphony.data.builtin import builtin_store
+from symphony.data.convert import merge
 from symphony.data.segment import AgentType, Polylines, RunSegment, SignalState
 from symphony.data.sources.womd import WomdReader
 from symphony.data.store import SegmentStore
@@ -41,6 +42,18 @@ from test_pretrained import load_script
 
 ABOUT = About("made")
 DT = 0.2
+
+
+def test_who_keeps_left_is_judged_as_who_keeps_right(tmp_path):
+    both = merge([brief(tmp_path / "store", (2, 4, 13, 21, 22), steps=51)], tmp_path / "both", mirror=1)
+    words = f"simulate constant_velocity --data {both.path} --interactive 4 --rollouts 1 --out {tmp_path / 'sim'}"
+    assert main(words.split()) == 0
+    rows = {row["segment"]: row for row in report(load_rollouts(tmp_path / "sim")).rows}
+    right, left = ([rows[name + end] for name in both.ids[:5]] for end in ("", "-mirrored"))
+    for name in ("collision", "at_fault_collision", "red_lights", "offroad_time", "wrong_way_time", "progress"):
+        found, mirrored = ([row[name] or 0.0 for row in side] for side in (right, left))
+        assert found == pytest.approx(mirrored, rel=1e-3, abs=1e-3)
+        assert any(found)
 
 
 def driving(*ways: tuple[float, float, float, float], steps: int = 21, **changes: Any) -> RunSegment:

@@ -18,7 +18,7 @@ from helpers_convert import FakeReader
 from helpers_segments import crossing, hide, segments, straight_road, turned
 from symphony.data.convert import convert, info
 from symphony.data.odd import LATE_EGO, NO_SIZE, THIN, WILD, from_ego, mended
-from symphony.data.resample import LOST, REPEATED, UNEVEN, evened, hold_lights, resample, smooth
+from symphony.data.resample import LOST, REPEATED, UNEVEN, evened, hold_lights, mirrored, resample, smooth
 from symphony.data.segment import RunSegment, SignalState, content_hash, validate
 from symphony.data.sources.base import Item, time_step
 from symphony.data.sources.interaction_tracks import Rows, stepped
@@ -49,6 +49,13 @@ def test_any_ratio_gives_a_valid_segment_of_the_same_span(log: RunSegment, ratio
     assert (new.num_steps - 1) * dt <= (log.num_steps - 1) * log.dt * (1 + 1e-5)
     assert new.num_steps * dt > (log.num_steps - 1) * log.dt
     assert new.current_step * dt <= log.current_step * log.dt + 1e-4
+
+
+@given(segments())
+def test_mirrored_twice_a_segment_is_as_it_was(log: RunSegment) -> None:
+    twice = mirrored(validate(mirrored(log.replace(goal=[3.0, 4.0]))))
+    assert twice.segment_id == f"{log.segment_id}-mirrored-mirrored"
+    assert content_hash(twice.replace(segment_id=log.segment_id)) == content_hash(log.replace(goal=[3.0, 4.0]))
 
 
 def test_interpolation_is_exact_for_uniform_motion() -> None:

@@ -24,7 +24,7 @@ from symphony.data.sources.commonroad import CommonRoadReader
 from symphony.data.store import SegmentStore
 from symphony.errors import DataError
 from symphony.learning.demonstrations import SceneDataset
-from symphony.saved.export import commonroad, to_dict
+from symphony.saved.export import as_json, commonroad
 from symphony.saved.folder import KEY, About, RolloutWriter, load_rollouts, read_tensors, tensors_of
 from symphony.saved.folder import save_rollouts as save_all
 from symphony.saved.rollouts import world_of
@@ -307,7 +307,7 @@ def test_json_says_who_is_the_ego_and_where_it_was_to_go():
     segment = crossing(4, steps=11).replace(ego=2, origin=np.array([300.0, -20.0, 5.0]))
     route = np.array([(0, 0, 0), (10, 5, 0)], np.float32)
     saved = played(segment, [1, 2], goal=np.array([[-1, 1]]), routes=Polylines.of([route + 7, route]))
-    by_id = {agent["id"]: agent for agent in to_dict(saved, 0)["agents"]}
+    by_id = {agent["id"]: agent for agent in json.loads(as_json(saved, 0))["agents"]}
     found = [by_id[int(number)] for number in segment.agent_id]
     assert [agent["ego"] for agent in found] == [False, False, True, False]
     routes = [agent.get("route", "none") for agent in found]
@@ -316,7 +316,7 @@ def test_json_says_who_is_the_ego_and_where_it_was_to_go():
     saved = played(straight_road(1), failed={0: "why"})
     saved.counted[:] = False
     assert "dynamicObstacle" not in commonroad(saved, 0)
-    assert to_dict(saved, 0)["agents"] == []
+    assert json.loads(as_json(saved, 0))["agents"] == []
 
 
 def test_the_command_writes_a_file_for_each_rollout(tmp_path, capsys):

@@ -177,9 +177,6 @@ def test_foreign_directories_are_left_alone(tmp_path: Path, folder: Path) -> Non
         StoreWriter(folder, append=True)
 
 
-# --- a writer that dies at any moment loses no segment that was on record, and none comes twice ------------
-
-
 @settings(max_examples=6, deadline=None)
 @given(data=st.data())
 def test_any_unfinished_tail_is_cut_off(data: st.DataObject) -> None:

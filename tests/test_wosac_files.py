@@ -241,8 +241,6 @@ def test_numbers_may_be_of_any_width_and_byte_order(tmp_path, kind):
     found.check(logged_scenario(womd_record()).sim_agents, count=2)
 
 
-# --- submissions: written, and refused before a server would ---
-
 ROLLOUTS = {name: record_rollouts(womd_record(name), seed=seed) for seed, name in enumerate(NAMES)}
 AGENTS = {name: [100, 101, 102] for name in NAMES}
 

@@ -270,9 +270,6 @@ def test_a_shorter_horizon_is_the_beginning_of_the_whole():
         score(wosac_scenario(window), long)
 
 
-# --- vehicles that stand and people who walk ---
-
-
 def halted(window):
     """Let all agents stand where they are at the current step."""
     now, still = np.full(window.num_steps, window.current_step), np.zeros_like(window.velocity)

@@ -22,8 +22,6 @@ from symphony.wosac.scorer.road import Edges, signed_distance_to_edges
 from symphony.wosac.scorer.scenario import STATES
 from symphony.wosac.scorer.scoring import bin_of, flag_log_likelihood, histogram_log_likelihood
 
-# --- features ---
-
 
 def every(features):
     """All features by name."""
@@ -179,9 +177,6 @@ def test_rollouts_that_cannot_be_scored(change, field, text):
     gone = replace(scenario, valid=scenario.valid & (np.arange(4) < 3)[:, None])
     with pytest.raises(DataError, match="agent 13 in the rollouts, but not valid at step 10"):
         compute_features(gone, made_rollouts(scenario))
-
-
-# --- from features to the score ---
 
 
 def made_features(**changes):

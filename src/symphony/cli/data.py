@@ -228,12 +228,13 @@ class Merge(shared.Command):
     #: Folders of the stores; they must have the same time step and no run segment in common.
     stores: Annotated[Positional[shared.Paths], arg(metavar="DIR ...")]
     out: Path  # Folder of the new store.
+    mirrored: bool = False  # Add each run segment mirrored, too: agents learn to drive on either side of the road.
 
     def __call__(self) -> None:
         from symphony.data.convert import merge
 
         with shared.progress("copying") as advance:
-            merge(self.stores, self.out, advance)
+            merge(self.stores, self.out, advance, mirror=self.mirrored)
         Info(store=self.out, interactive=0)()
 
 

@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatch
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -426,14 +427,14 @@ def info(path: str | Path) -> dict[str, Any]:
     }
 
 
-def merge(paths: Sequence[Path], out: Path, progress: Told = lambda *_: None) -> SegmentStore:
+def merge(paths: Sequence[Path], out: Path, progress: Told = lambda *_: None, mirror: int = 0) -> SegmentStore:
     """Copy all segments of some stores, in their order, into a new one, which appears once it is complete.
 
-    Its report joins theirs. ``progress`` is told how many segments are done, of how many. A :class:`DataError` names
-    the store if ``out`` exists or is being made, a segment is in two stores, the generation of one is not finished,
-    or stores differ in their time step.
+    With ``mirror`` (1) all follow once more, mirrored. Its report joins theirs. ``progress`` is told how many
+    segments are done, of how many. A :class:`DataError` names the store if ``out`` exists or is being made, a segment
+    is in two stores, the generation of one is not finished, or stores differ in their time step.
     """
-    out, seen = out.resolve(), set[str]()
+    out, seen, report = out.resolve(), set[str](), Report()
     if out.exists():
         raise DataError("exists already; choose another folder", file=out)
     stores = [SegmentStore(path) for path in paths]
@@ -443,6 +444,7 @@ def merge(paths: Sequence[Path], out: Path, progress: Told = lambda *_: None) ->
         seen.update(store.ids)
         if store.unfinished is not None:
             raise DataError(store.unfinished, file=store.path)
+        report = Report.from_json(store.report).after(report)
     steps = {float(dt) for store in stores for dt in store.time_steps}
     if len(steps) > 1:
         listed = ", ".join(f"{dt:g} s" for dt in sorted(steps))
@@ -457,15 +459,14 @@ def merge(paths: Sequence[Path], out: Path, progress: Told = lambda *_: None) ->
         with store_format.lock(draft):
             for part in sorted(draft.iterdir(), key=lambda part: part.name == store_format.HEADER):
                 (shutil.rmtree if part.is_dir() else Path.unlink)(part)  # at last what says that it is a store
-    total = sum(map(len, stores))
+    total = sum(map(len, stores)) * (1 + mirror)
     with StoreWriter(draft) as writer:
-        report = Report()
-        for store in stores:
-            report = Report.from_json(store.report).after(report)
+        ways = writer.copy, lambda store, k: writer.append(resampling.mirrored(store[k]), tags=store.tags(k))
+        for way, store in product(ways[: 1 + mirror], stores):
             for index in range(len(store)):
-                writer.copy(store, index)
+                way(store, index)
                 progress(len(writer), total)
-    report = replace(report, converted=total, settings={"merged": [store.path.name for store in stores]})
+    report = replace(report, converted=total, settings={"merged": [s.path.name for s in stores], "mirrored": mirror})
     writer.write_report(report.to_json())
     draft.rename(out)
     return SegmentStore(out)

@@ -1,10 +1,11 @@
-"""Changing a run segment's time step, smoothing noisy logs, and filling in lights.
+"""Changing a run segment's time step, smoothing noisy logs, filling in lights, and mirroring.
 
 These are choices of the one who prepares the data; readers keep to the log.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from symphony.data import segment as schema
 from symphony.data.odd import noted
-from symphony.data.segment import STATES, Bools, Ints, RunSegment, SignalState, validate, wrap
+from symphony.data.segment import STATES, Bools, Ints, Polylines, RunSegment, SignalState, validate, wrap
 from symphony.errors import ConfigError
 
 Doubles = NDArray[np.float64]
@@ -66,6 +67,23 @@ def hold_lights(segment: RunSegment) -> RunSegment:
     last = np.maximum.accumulate(np.where(known, np.arange(state.shape[1]), -1), axis=1)
     source = np.where(last < 0, known.argmax(1)[:, None], last)
     return segment.replace(signal_state=np.take_along_axis(state, source, axis=1))
+
+
+def mirrored(segment: RunSegment) -> RunSegment:
+    """Return the segment mirrored at the x axis, where who kept right keeps left, under a name of its own."""
+
+    def flipped(points: NDArray[Any]) -> NDArray[Any]:
+        return points * np.array([1, -1, 1], points.dtype)[: points.shape[-1]]
+
+    road = segment.road
+    lanes, marks = (replace(lines, points=flipped(lines.points)) for lines in (road.lanes, road.marks))
+    edges = Polylines.of([flipped(road.boundary[k])[::-1] for k in range(len(road.boundary))])
+    road = replace(road, lanes=lanes, marks=marks, boundary=edges)
+    road = replace(road, left_neighbors=road.right_neighbors, right_neighbors=road.left_neighbors)
+    changed = {name: flipped(getattr(segment, name)) for name in ("position", "velocity", "signal_point", "origin")}
+    goal = segment.goal and flipped(np.array(segment.goal)).tolist()
+    name, group = (f"{name}-mirrored" for name in (segment.segment_id, segment.group or segment.segment_id))
+    return segment.replace(segment_id=name, group=group, road=road, heading=-segment.heading, goal=goal, **changed)
 
 
 def _interpolate(segment: RunSegment, ratio: float, dt: float) -> RunSegment:

@@ -184,18 +184,17 @@ class _Network:
         _add(node, "active", "true")
 
 
-def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
-    """Return a rollout for JSON: agents with states (step, x, y, heading, speed), routes, events, lights, map."""
+def as_json(saved: SavedRollouts, rollout: int) -> str:
+    """Return a rollout as JSON: agents with states (step, x, y, heading, speed), routes, events, lights, map."""
     segment, world, origin = saved.segment, world_of(saved, rollout), saved.segment.origin[:2]
     place = world.position + origin
     agents = []
     for row in np.flatnonzero(world.valid.any(1)).tolist():
         values = np.column_stack([place[row], world.heading[row], world.speed[row]])
         steps = np.flatnonzero(world.valid[row]).tolist()
-        kind = AgentType(segment.agent_type[row]).name.lower()
-        agent: dict[str, Any] = {"id": int(segment.agent_id[row]), "type": kind}
-        agent |= dict(zip(("length", "width"), segment.size[row, :2].tolist(), strict=True))
-        agent |= {"ego": row == segment.ego, "driver": PLAYBACK}
+        length, width = segment.size[row, :2].tolist()
+        agent: dict[str, Any] = {"id": int(segment.agent_id[row]), "driver": PLAYBACK, "length": length}
+        agent |= {"type": AgentType(segment.agent_type[row]).name.lower(), "width": width, "ego": row == segment.ego}
         agent["states"] = [[step, *(round(value, 6) for value in values[step].tolist())] for step in steps]
         for n in np.flatnonzero(saved.agents == row).tolist():
             agent["driver"], route = saved.drivers[n], int(saved.goal[rollout, n])
@@ -208,15 +207,9 @@ def to_dict(saved: SavedRollouts, rollout: int) -> dict[str, Any]:
     plain = {name: [(x[k][:, :2] + origin).tolist() for k in range(len(x))] for name, x in road.items()}
     lights = []
     for light, lane in enumerate(segment.signal_lane.tolist()):
-        shown = segment.signal_state[light, saved.start : saved.last + 1]
-        names = [SignalState(state).name.lower() for state in shown.tolist()]
+        shown = segment.signal_state[light, saved.start : saved.last + 1].tolist()
         stop = (segment.signal_point[light, :2] + origin).tolist()
-        lights.append({"lane": lane, "stop": stop, "states": names})
+        lights.append({"lane": lane, "stop": stop, "states": [SignalState(state).name.lower() for state in shown]})
     found: dict[str, Any] = {"segment": segment.segment_id, "rollout": rollout, "dt": float(segment.dt)}
-    found |= {"steps": saved.steps, "failed": saved.failed.get(rollout), "agents": agents}
-    return found | {"lights": lights, "map": plain}
-
-
-def as_json(saved: SavedRollouts, rollout: int) -> str:
-    """Return :func:`to_dict` as text."""
-    return json.dumps(to_dict(saved, rollout), allow_nan=False) + "\n"
+    found |= {"steps": saved.steps, "failed": saved.failed.get(rollout), "agents": agents, "lights": lights}
+    return json.dumps(found | {"map": plain}, allow_nan=False) + "\n"

@@ -118,7 +118,7 @@ def _rows(names: list[str], text: str, first: int) -> Rows:
         return np.array(found)
 
     needed = [column(name, _number) for name in ("x", "y", "vx", "vy")]
-    given = [column(name, _number_or_none) for name in ("psi_rad", "length", "width")]
+    given = [column(name, partial(_number, unknown=("", "nan"))) for name in ("psi_rad", "length", "width")]
     marks = [column(name, _whole, "0") for name in ("track_to_predict", "interesting_agent")]
     return Rows(
         case=column("case_id", _whole, "0"),
@@ -130,15 +130,13 @@ def _rows(names: list[str], text: str, first: int) -> Rows:
     )
 
 
-def _number(text: str, most: float = 1e8) -> float:
+def _number(text: str, most: float = 1e8, unknown: tuple[str, ...] = ()) -> float:
+    if text.strip().lower() in unknown:
+        return np.nan
     value = float(text)
     if not abs(value) <= most:
         raise ValueError(text)
     return value
-
-
-def _number_or_none(text: str) -> float:
-    return _number(text) if text.strip().lower() not in {"", "nan"} else np.nan
 
 
 def _whole(text: str) -> int:
