@@ -408,9 +408,6 @@ def test_nobody_drives_over_a_red_light(driven: list[RunSegment]) -> None:
     assert offences == 0
 
 
-# Roads of one's own
-
-
 def driven_length(file: Path) -> float:
     """Metres of lane for traffic."""
     _, length, lanes = read_network(file).edge_graph()
@@ -577,9 +574,6 @@ def test_what_is_no_map_is_an_error_that_names_it(tmp_path: Path, text: str, mon
             own_network(tmp_path / name, tmp_path)
     with pytest.raises(ConfigError, match="there is no file"):
         Plan(1, kinds=("nowhere.xodr",))
-
-
-# The built-in set
 
 
 def test_builtin_sets_are_small_varied_and_apart() -> None:

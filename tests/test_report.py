@@ -45,15 +45,15 @@ DT = 0.2
 
 
 def test_who_keeps_left_is_judged_as_who_keeps_right(tmp_path):
-    both = merge([brief(tmp_path / "store", (2, 4, 13, 21, 22), steps=51)], tmp_path / "both", mirror=1)
+    both = merge([brief(tmp_path / "store", (2, 4, 13, 21, 22), steps=51)], tmp_path / "both", mirror=True)
     words = f"simulate constant_velocity --data {both.path} --interactive 4 --rollouts 1 --out {tmp_path / 'sim'}"
     assert main(words.split()) == 0
     rows = {row["segment"]: row for row in report(load_rollouts(tmp_path / "sim")).rows}
     right, left = ([rows[name + end] for name in both.ids[:5]] for end in ("", "-mirrored"))
     for name in ("collision", "at_fault_collision", "red_lights", "offroad_time", "wrong_way_time", "progress"):
-        found, mirrored = ([row[name] or 0.0 for row in side] for side in (right, left))
-        assert found == pytest.approx(mirrored, rel=1e-3, abs=1e-3)
-        assert any(found)
+        found, mirrored = ([math.nan if row[name] is None else row[name] for row in side] for side in (right, left))
+        assert found == pytest.approx(mirrored, rel=1e-3, abs=1e-3, nan_ok=True)
+        assert np.nansum(found)
 
 
 def driving(*ways: tuple[float, float, float, float], steps: int = 21, **changes: Any) -> RunSegment:

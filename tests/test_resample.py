@@ -53,7 +53,9 @@ def test_any_ratio_gives_a_valid_segment_of_the_same_span(log: RunSegment, ratio
 
 @given(segments())
 def test_mirrored_twice_a_segment_is_as_it_was(log: RunSegment) -> None:
-    twice = mirrored(validate(mirrored(log.replace(goal=[3.0, 4.0]))))
+    once = validate(mirrored(log.replace(goal=[3.0, 4.0])))
+    assert (once.goal, once.road.left_neighbors.tolist()) == ([3.0, -4.0], log.road.right_neighbors.tolist())
+    twice = mirrored(once)
     assert twice.segment_id == f"{log.segment_id}-mirrored-mirrored"
     assert content_hash(twice.replace(segment_id=log.segment_id)) == content_hash(log.replace(goal=[3.0, 4.0]))
 

@@ -427,10 +427,10 @@ def info(path: str | Path) -> dict[str, Any]:
     }
 
 
-def merge(paths: Sequence[Path], out: Path, progress: Told = lambda *_: None, mirror: int = 0) -> SegmentStore:
+def merge(paths: Sequence[Path], out: Path, progress: Told = lambda *_: None, mirror: bool = False) -> SegmentStore:
     """Copy all segments of some stores, in their order, into a new one, which appears once it is complete.
 
-    With ``mirror`` (1) all follow once more, mirrored. Its report joins theirs. ``progress`` is told how many
+    With ``mirror`` all follow once more, mirrored. Its report joins theirs. ``progress`` is told how many
     segments are done, of how many. A :class:`DataError` names the store if ``out`` exists or is being made, a segment
     is in two stores, the generation of one is not finished, or stores differ in their time step.
     """
