@@ -13,7 +13,7 @@ DEV := $(VENV)/.dev
 CONSTRAINTS ?= constraints.txt
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS)
 # All of them, so that no test is skipped for lack of one.
-EXTRAS := dev,docs,argoverse2,ray,sumo,gym,video,mcap
+EXTRAS := dev,docs,argoverse2,ray,sumo,gym,video
 SPELLED := src tests recipes examples benchmarks docs README.md CONTRIBUTING.md CHANGELOG.md SECURITY.md
 
 .DEFAULT_GOAL := help

@@ -1,6 +1,6 @@
 """Behavioural cloning with goals, and a policy gradient against collisions in closed loop: not in the paper.
 
-It is for an agent that drives already (`--warm-start`). The included ones had `--search.branches 8`.
+It is for an agent that drives already (`--warm-start`). The included one had 8 branches with goals of their own.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def bc_rl_h(config: TrainConfig, processes: Processes) -> Trainer:
     policy, goals = policy_network(spec), goal_network(spec)
     agent = Agent(str(config.out), policy, spec, goals).to(processes.device)
 
-    # Environment and collector: nothing is pruned, and each branch has its own goals.
+    # Environment and collector: nothing is pruned.
     env = DrivingEnv(data, dynamics, observation_of(spec), generator=rng, device=processes.device)
     rows = config.rows(len(data))
     collector = BeamSearchCollector(

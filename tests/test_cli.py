@@ -273,7 +273,7 @@ def test_doctor_simulates_and_says_what_is_there(capsys: pytest.CaptureFixture[s
     assert main(["doctor", "--json", "-"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["simulation"]["rollouts"], bool(found["packages"]["torch"])) == (2, True)
-    assert set(found["extras"]) == {"eclipse-sumo", "pyarrow", "ray", "imageio-ffmpeg", "gymnasium", "mcap"}
+    assert set(found["extras"]) == {"eclipse-sumo", "pyarrow", "ray", "imageio-ffmpeg", "gymnasium"}
 
 
 @cache

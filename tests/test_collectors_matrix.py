@@ -46,6 +46,7 @@ TRANSFORMS: dict[str, Callable[[Any], list[envs.Transform]]] = {
     "norm": lambda key: [envs.ObservationNorm(0.1, 2.0, in_keys=[key], standard_normal=True)],
     "frames": lambda key: [envs.CatFrames(3, -1, in_keys=[key], padding="same")],
     "statistics": lambda key: [envs.VecNormV2(in_keys=[key], reduce_batch_dims=True)],
+    "scaled": lambda key: [envs.ActionScaling(acting(key, 2).out_keys)],
     "statistics, old": lambda key: [envs.VecNorm(in_keys=[key], new_api=False)],
 }
 
@@ -162,6 +163,15 @@ def test_exploration_takes_the_specs_of_the_environment(exploration):
     assert action.abs().max() <= 1
     assert len(action.flatten().unique()) > action.numel() / 4
     assert module.spec.shape == before
+
+
+@pytest.mark.parametrize("kind", ["rows", "one", "own batch"])
+def test_a_policy_may_return_its_outputs_alone_or_be_safe(kind):
+    policy, spec = acting("observation", 2), ENVIRONMENTS[kind]().action_spec
+    safe = modules.SafeModule(policy.module, ["observation"], ["action"], spec, safe=True)
+    for other in (safe, lambda td: policy(td).select("action")):
+        one, two = (beams(ENVIRONMENTS[kind](), each, branches=4).next()["action"] for each in (policy, other))
+        assert (one == two).all()
 
 
 def test_rows_are_a_batch_of_an_environment():

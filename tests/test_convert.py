@@ -196,6 +196,9 @@ def test_the_merged_store_holds_every_segment_as_it_was(tmp_path: Path) -> None:
     both = merge(PARTS[1:], tmp_path / "both", mirror=True)
     assert len(both) == both.report["converted"] == 2 * len(stores[1])
     assert (both.tags(-1), both.ids[-1]) == (stores[1].tags(-1), f"{stores[1].ids[-1]}-mirrored")
+    assert set(both.groups) == set(stores[1].groups)  # of the same recordings
+    with pytest.raises(DataError, match="already"):
+        merge([tmp_path / "both"], tmp_path / "thrice", mirror=True)
 
 
 def test_a_merge_that_was_killed_is_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

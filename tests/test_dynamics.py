@@ -41,6 +41,8 @@ def test_displacement_inverse_and_forward_are_exact():
     torch.testing.assert_close(displacement_step(state, action, LENGTH, DT)[:, :2], other[:, :2])
     back = module.displacement_inverse(state, displacement_step(state, action, LENGTH, DT))
     torch.testing.assert_close(back, action)
+    speed = action.norm(dim=-1).where(action[:, 0] > 0, -action.norm(dim=-1)) / DT  # backwards is negative
+    torch.testing.assert_close(displacement_step(state, action, LENGTH, DT)[:, 3], speed)
 
 
 @given(angle=st.floats(-3, 3), x=st.floats(-50, 50), y=st.floats(-50, 50))

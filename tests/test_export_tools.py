@@ -1,28 +1,20 @@
-"""Rollouts for other tools: what OpenSCENARIO and MCAP hold is what was simulated."""
+"""Rollouts for other tools: what OpenSCENARIO holds is what was simulated."""
 
 from __future__ import annotations
 
-import dataclasses
 import xml.etree.ElementTree as ET
 from collections import defaultdict
 
 import numpy as np
-import pytest
 
 from helpers_saved import played, searched
 from helpers_segments import crossing, hide, straight_road, turned
-from symphony.cli import main
-from symphony.data.segment import Polylines, SignalState
-from symphony.saved.folder import About, save_rollouts
 from symphony.saved.openscenario import openscenario
 from symphony.saved.rollouts import world_of
 
 
 def cases():
     seen = hide(hide(crossing(4, steps=31), 2, slice(5, 9)), 3, slice(0, 30))
-    lines = {name: getattr(seen.road, name) for name in ("lanes", "boundary", "marks")}  # on a hill
-    hill = {name: Polylines(one.points + np.float32([0, 0, 12]), one.offsets) for name, one in lines.items()}
-    seen = seen.replace(road=dataclasses.replace(seen.road, **hill))
     seen = seen.replace(agent_type=np.array([1, 2, 3, 4], np.uint8), origin=np.array([5e5, -20.0, 0]))
     return [played(seen, [0, 1]), *searched()[1]]
 
@@ -72,46 +64,3 @@ def test_openscenario_has_every_agent_where_it_was():
         place = (x + 1j * y) * np.exp(1j)
         turn = np.stack([place.real, place.imag, heading + 1.0], -1)
         np.testing.assert_allclose(list(after[name].values()), turn, atol=1e-3)
-
-
-def test_mcap_has_every_agent_where_it_was(tmp_path):
-    """A message for each state; who collides has a red frame then; the transforms lead to the source's frame."""
-    reader = pytest.importorskip("mcap.reader", reason="mcap is not installed")
-    from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-
-    kinds = {"foxglove.SceneUpdate": SceneUpdate, "foxglove.FrameTransforms": FrameTransforms}
-    for one in cases():
-        third = (np.arange(one.steps) % 3 == 1)[:, None]
-        saved = dataclasses.replace(one, collision=one.counted & third)
-        segment, world, place = saved.segment, world_of(saved, 0), list(saved.agents)
-        sim, messages = tmp_path / segment.segment_id, defaultdict(list)
-        save_rollouts(sim, About("made"), [saved])
-        assert main(["export", str(sim), "--format", "mcap", "--rollouts", "0"]) == 0
-        with next((sim / "export").iterdir()).open("rb") as file:
-            for schema, channel, message in reader.make_reader(file).iter_messages():
-                content = kinds[schema.name].FromString(message.data)
-                messages[channel.topic].append((message.log_time, content))
-        times = [round(step * segment.dt * 1e9) for step in range(saved.steps + 1)]
-        assert [at for at, _ in messages["/traffic"]] == [at for at, _ in messages["/tf"]] == times
-        lines = sum(len(getattr(segment.road, name)) for name in ("lanes", "boundary", "marks"))
-        assert len(messages["/map"][0][1].entities[0].lines) == lines
-        # On a map without levels everything stands at 0.
-        assert {p.z for line in messages["/map"][0][1].entities[0].lines for p in line.points} == {0.0}
-        for step, (_, now) in enumerate(messages["/traffic"]):
-            *boxes, lights = now.entities
-            rows = [segment.agent_id.tolist().index(int(box.id)) for box in boxes]
-            assert rows == np.flatnonzero(world.valid[:, step]).tolist()
-            for row, box in zip(rows, boxes, strict=True):
-                at, turn, size = box.cubes[0].pose.position, box.cubes[0].pose.orientation, box.cubes[0].size
-                found = [at.x, at.y, size.x, size.y]
-                np.testing.assert_allclose(found, [*world.position[row, step], *world.size[row]], atol=1e-6)
-                heading = np.exp(1j * world.heading[row, step])
-                np.testing.assert_allclose(np.exp(2j * np.arctan2(turn.z, turn.w)), heading)
-                hit = row in place and step % 3 == 2 and saved.counted[0, step - 1, place.index(row)]
-                assert bool(box.lines) == hit
-            red = [light.color.r > 0.8 and light.color.g < 0.5 for light in lights.spheres]
-            assert red == (segment.signal_state[:, saved.start + step] == SignalState.STOP).tolist()
-            moves = [frame.translation for frame in messages["/tf"][step][1].transforms]
-            ego = np.sum([(move.x, move.y) for move in moves], 0) - segment.origin[:2]
-            np.testing.assert_allclose(ego, world.position[segment.ego, step], atol=1e-6)

@@ -494,6 +494,9 @@ def test_a_straight_road_is_seen_from_its_middle_whatever_its_limit_says(
     lanes = f'<center><lane id="0" type="none"/></center><right>{LANE.format(-1, 3, "")}</right>'
     text = XODR.format(pieces='<geometry s="0" x="0" y="0" hdg="0" length="250"><line/></geometry>', lanes=lanes)
     file = tmp_path / "straight.xodr"
+    file.write_text(text[:200])
+    with pytest.raises(DataError, match=r"straight\.xodr: not well-formed XML"):
+        generate(Plan(1, kinds=(str(file),)), tmp_path / "out")
     file.write_text(text.replace('max="30" unit="mph"', limit))
     network = read_network(own_network(file, tmp_path))
     limits = zip(network.speed, network.internal, strict=True)

@@ -195,6 +195,8 @@ def test_of_a_trajectory_the_first_state_is_driven() -> None:
     poses = [Pose(1.0 + k, 2.0, 0.1, 5.0) for k in range(4)]
     at = np.array([0.0, 2.0, 0.1, 5.0])
     assert checked_plan(poses, at, 0.2).tolist() == list(poses[0])
+    assert [checked_plan((1.0, 2.0, 0.1, v), at, 0.2)[3] for v in (0, 2.95, 7.05, 9)] == [5, 2.95, 7.05, 5]
+    assert checked_plan((-1.0, 2.0, 0.1, 5.0), at, 0.2)[3] == -5
     for wrong in (np.zeros((0, 4)), np.zeros((3, 2)), np.zeros((2, 2, 4))):
         with pytest.raises(ValueError, match="a plan is"):
             checked_plan(wrong, at, 0.2)
@@ -391,7 +393,7 @@ def test_two_planners_each_see_the_scene_from_their_own_seat(search: Any, tmp_pa
         def plan(self, seen: Traffic) -> list[Pose]:
             assert (seen.ego, np.abs(seen.state - self.at).max() < 1e-3) == (self.me, True), "another's"
             assert sorted(np.abs(seen.position[list(ends)] - self.at[:2]).max(1) > 1) == [False, True]
-            self.at = self.at + np.array([2.0 + self.rng.random(), 0.0, 0.0, 0.0])
+            self.at = self.at + np.array([0.2 * self.at[3] + 0.3 * self.rng.random(), 0, 0, 0])
             ends[self.me].append(self.at[0])
             return [Pose(*self.at), Pose(*self.at)]
 

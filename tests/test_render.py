@@ -459,6 +459,8 @@ def test_missing_and_odd_values_are_tolerated(tmp_path: Path) -> None:
     assert list(curves) == ["auc", "late"]
     np.testing.assert_array_equal(curves["auc"], [[1, 2, 3], [nan, nan, 0.5]])
     assert plot_curves({"odd": odd}, tmp_path / "odd.svg").axes[0].lines[1].get_marker() == "o"
+    plot_curves({"odd": odd}, tmp_path / "again.svg")
+    assert (tmp_path / "odd.svg").read_bytes() == (tmp_path / "again.svg").read_bytes()
     many = {"many": records(ttc_p5=1.0, ttc_p25=2.0, ttc_p50=3.0, ttc_p75=4.0)}
     (axes, *_) = plot_curves(many, tmp_path / "many.svg").axes
     assert (len(axes.lines), len(axes.get_legend().get_texts())) == (8, 4)

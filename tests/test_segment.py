@@ -173,10 +173,14 @@ def test_any_number_changes_the_hash(name: str) -> None:
 def test_odd_values_are_named() -> None:
     segment = straight_road(3, steps=8)
     away = segment.replace(position=segment.position + np.float32(2000))
-    assert oddities(segment) == oddities(validate(hide(away, 1, slice(2, 4)))) == []
+    lanes = segment.road.lanes
+    far = Polylines(lanes.points + np.float32(2000), lanes.offsets)
+    near = away.replace(road=dataclasses.replace(segment.road, lanes=far))
+    assert oddities(segment) == oddities(validate(hide(near, 1, slice(2, 4)))) == []
     fast = segment.replace(velocity=segment.velocity + np.float32(80))
     small = segment.replace(size=segment.size * np.float32(0.1))
     jumping = segment.replace(position=moved(segment.position, 100))
-    for odd, word in ((fast, "faster"), (small, "under 0.2 m"), (jumping, "jumps")):
-        (found,) = oddities(validate(odd))
-        assert word in found
+    slow = segment.replace(velocity=segment.velocity * np.float32(0.28))
+    kinds = (fast, "faster"), (small, "under 0.2 m"), (jumping, "jumps"), (slow, "velocities"), (away, "away")
+    for odd, word in kinds:
+        assert word in oddities(validate(odd))[0]

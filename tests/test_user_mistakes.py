@@ -133,6 +133,11 @@ def test_a_command_is_what_it_starts_and_what_that_reads(tmp_path: Path) -> None
         script.write_text(text)
         found += [source_of(f"pipe:{sys.executable} {script}"), source_of(f"pipe:python {script}")]
     assert len(set(found)) == 4
+    script.write_text("import beside_mine\ndef plan(seen): return 0.0, 0.0\n")
+    for text in ("A = 1", "A = 2"):
+        (tmp_path / "beside_mine.py").write_text(text)
+        found.append(source_of(f"{script}:plan"))
+    assert len(set(found)) == 6
     assert source_of(f"pipe:{sys.executable} -c '{'#' * 300}'") == source_of(f"pipe:{sys.executable} -c ''")
 
 
@@ -161,6 +166,12 @@ def test_a_folder_is_not_gone_on_with_by_another_simulation(store: Path, run: Pa
     assert len(load_rollouts("a")) == 2
     code, words = told("simulate", *again, 2, "--goals", "tree")
     assert (code, "differs in settings.goals" in words) == (1, True)
+
+
+@pytest.mark.parametrize("command", ["evaluate", "simulate --out sim"])
+def test_an_option_without_effect_is_refused(told: Any, store: Path, command: str) -> None:
+    code, words = told(*command.split(), "pretrained:bc_ts_h", "--data", store, "--branches", 8)
+    assert (code, "--branches has no effect on search 'backtrack'" in words) == (1, True)
 
 
 @pytest.mark.parametrize(("words", "message"), [

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from bridges import bridges
-from made import NORTH, OWN, Case, segment_of
-from scenes import car, cases, ego
+from made import Case, segment_of
+from scenes import cases
 
 from helpers_saved import played
-from helpers_segments import hide, turned
+from helpers_segments import hide, make_road, make_segment, turned
 from symphony.data.segment import AgentType
 from symphony.envs.flags import offroad_flags
 from symphony.envs.objects import rollout_heights
@@ -20,8 +21,6 @@ from symphony.envs.scene import collate, scene
 from symphony.evaluation.contacts import contacts
 from symphony.evaluation.report import KIND_NAMES, Report, add_segment
 from symphony.metrics import CollisionKind, collision_kinds
-from symphony.render.plots import draw_hit, saved_clip
-from symphony.render.style import new_figure
 from symphony.rollouts.unroll import between_states
 from symphony.saved.rollouts import SavedRollouts, world_of
 
@@ -113,16 +112,18 @@ def test_a_report_says_what_is_right(case: Case, dt: float) -> None:
         check(case, found.rows[0], found.events[case.name], saved, phase * dt)
 
 
-def test_who_stands_on_a_bridge_is_not_drawn_as_hit() -> None:
-    """The ego hits a car that stands below another."""
-    others = car(165, OWN, 0.0, NORTH), car(165, OWN, 0.0, NORTH, z=6.0)
-    segment, _ = segment_of(Case("below", "", ego(8.0, x=165 - 0.9 - 2.25 - 20), others, bridge=6.0), 0.2, 0.0)
-    saved = played(segment)
-    (found,) = contacts([world_of(saved, 0)], np.array([0]))
-    saved.collision[0, found.step[0] - 1 :, 0] = True
-    draw_hit(axes := new_figure(4, 4).add_subplot(), saved_clip(saved))
-    (drawn,) = (artist for artist in axes.get_children() if artist.get_gid() == "hit")
-    assert len(drawn.get_paths()) == len(found.other) == 1
+@pytest.mark.parametrize(("angle", "cut"), [*product([0.1, 0.2, 0.4, 0.7], [False, True])])
+def test_where_two_lanes_merge_the_one_that_bends_cuts_in(angle: float, cut: bool) -> None:
+    slope, time = np.array([np.cos(angle), np.sin(angle)]), np.arange(41) * 0.2 - 4
+    main, ramp = np.arange(-200.0, 401, 2)[:, None] * [1, 0], np.arange(-120.0, 1, 2)[:, None] * slope
+    lanes = make_road([main[:101], main[100:], ramp], [(0, 1), (2, 1)])
+    past = np.stack([7.5 + 9 * time, 0.3 + 16 * time][:: -1 if cut else 1])  # metres past the merge
+    way = np.where((past < 0)[..., None] & [[[False]], [[True]]], slope, [1, 0])
+    heading, speed = np.arctan2(way[..., 1], way[..., 0]), np.diff(past, axis=1)[:, :1, None] / 0.2
+    for ego, fault in ((0, False), (1, True)):
+        segment = make_segment(lanes, past[..., None] * way, heading, speed * way, 0.2).replace(ego=ego)
+        add_segment(found := Report("made", "ego"), played(segment, [ego]))
+        assert (found.rows[0]["collision"], found.rows[0]["at_fault_collision"]) == (True, fault)
 
 
 @pytest.mark.parametrize("hidden", [slice(1, 7), slice(2, 7), slice(1, 4)])

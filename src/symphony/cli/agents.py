@@ -27,7 +27,7 @@ PANELS, SHOWN, NAMED = 6, 8, 5
 BASELINES = {"log playback": "playback", "constant velocity": "constant_velocity"}
 """Agents of the demo by their titles, of which only the numbers are shown."""
 PACKAGES = "torch torchrl tensordict numpy shapely matplotlib wandb safetensors"
-EXTRAS = "eclipse-sumo pyarrow ray imageio-ffmpeg gymnasium mcap"
+EXTRAS = "eclipse-sumo pyarrow ray imageio-ffmpeg gymnasium"
 
 
 class Train(shared.Command):
@@ -81,6 +81,7 @@ class Evaluate(shared.SimulationOptions):
             picture_path(self.figure, (*FORMATS, *ANIMATIONS))
         agent = symphony.load_agent(self.agent, self.config.device, trust_code=self.trust_code)
         store, config = symphony.SegmentStore(self.data), self.config
+        shared.check_search(agent, config)
         chosen = shared.segment_indices(store, self.segments)
         if self.metrics:
             from symphony.wosac.evaluate import evaluate_wosac, scorable, wosac_parts
@@ -229,7 +230,7 @@ class Doctor(shared.Command):
     def __call__(self) -> None:
         import torch
 
-        began, second = time.perf_counter(), symphony.EvaluateConfig(rollouts=2, branches=2, duration=1)
+        began, second = time.perf_counter(), symphony.EvaluateConfig(rollouts=2, duration=1)
         test = symphony.builtin_store("test")
         numbers = symphony.evaluate("pretrained:bc_ts_h", test, second, items=[0]).numbers()
         spent, held = time.perf_counter() - began, {one.name: one.version for one in distributions()}

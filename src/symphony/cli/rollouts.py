@@ -58,6 +58,7 @@ class Simulate(shared.SimulationOptions):
         config: EvaluateConfig = self.config
         config = dataclasses.replace(config, rollouts=config.trees) if self.runs else config
         config = beside_planner(config) if planner else config
+        shared.check_search(agent, config)
         chosen = shared.segment_indices(store, self.segments)
         if self.runs:
             count, config = spread_runs(agent, config, self.runs, len(store), planned=bool(planner))
@@ -185,22 +186,21 @@ class Export(shared.Command):
     """Write saved rollouts in a format of other tools, one file each."""
 
     folder: shared.Saved
-    #: Format: CommonRoad scenarios (XML 2020a), JSON, OpenSCENARIO (XML 1.2), or MCAP for Foxglove (extra `mcap`).
-    format: Literal["commonroad", "json", "openscenario", "mcap"] = "commonroad"
+    #: Format: CommonRoad scenarios (XML 2020a), JSON, or OpenSCENARIO (XML 1.2).
+    format: Literal["commonroad", "json", "openscenario"] = "commonroad"
     out: shared.Folder = None  # Folder of the files; by default the folder `export` within SIM.
     segments: shared.Ids = ()
     #: Numbers of the rollouts to export of each run segment, counted from 0; by default all.
     rollouts: Annotated[tuple[int, ...], arg(metavar="K ...")] = ()
 
     def __call__(self) -> None:
-        from symphony.saved import export, folder, foxglove, openscenario
+        from symphony.saved import export, folder, openscenario
 
         held, count = folder.load_rollouts(self.folder), 0
-        writers: dict[str, tuple[Callable[..., str | bytes], str]] = {
+        writers: dict[str, tuple[Callable[..., str], str]] = {
             "commonroad": (export.commonroad, "xml"),
             "json": (export.as_json, "json"),
             "openscenario": (openscenario.openscenario, "xosc"),
-            "mcap": (foxglove.mcap, "mcap"),
         }
         write, suffix = writers[self.format]
         with files.Lock((out := self.out or self.folder / "export") / "export.lock"):
@@ -209,8 +209,7 @@ class Export(shared.Command):
                 for k in dict.fromkeys(self.rollouts or range(saved.rollouts)):
                     if not 0 <= k < saved.rollouts:
                         raise errors.ConfigError(f"{name} has rollouts 0 to {saved.rollouts - 1}, not {k}")
-                    made = write(saved, k)
                     with files.replacing(out / f"{folder.file_stem(name)}-{k}.{suffix}") as draft:
-                        draft.write_bytes(made if isinstance(made, bytes) else made.encode())
+                        draft.write_text(write(saved, k), encoding="utf-8")
                     count += 1
         shared.say(f"written: {count} file{'s' * (count != 1)} in {out}")

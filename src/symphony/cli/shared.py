@@ -62,6 +62,14 @@ class SimulationOptions(Command):
     config: Annotated[EvaluateConfig, arg(name="")] = field(default_factory=EvaluateConfig)
 
 
+def check_search(agent: symphony.Agent, config: EvaluateConfig) -> None:
+    """Raise a ConfigError for an option that has no effect on the search with which an agent is simulated."""
+    kind = agent.plan(config).kind
+    for name in {"tree": (), "backtrack": evaluation.OF_TREES}.get(kind, evaluation.OF_SEARCHES):
+        if getattr(config, name) != getattr(EvaluateConfig, name):
+            raise errors.ConfigError(f"--{name.replace('_', '-')} has no effect on search '{kind}': see --search")
+
+
 def segment_indices(store: symphony.SegmentStore, names: Sequence[str]) -> list[int]:
     """Return the places of run segments in a store; each must be named once, by its id or its number."""
     found: dict[int, str] = {}

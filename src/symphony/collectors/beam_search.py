@@ -346,7 +346,8 @@ def _step(
     env: EnvBase, policy: Policy, score: Score, keep: Sequence[NestedKey] | None, now: TensorDictBase
 ) -> tuple[TensorDictBase, TensorDictBase, Float[Tensor, "*b S N"], Bool[Tensor, "*b S K"]]:
     """Return a step's kept entries, next state, scores, and which episodes ended; one program if compiled."""
-    stepped = env.step(policy(now))
+    acted = policy(now)
+    stepped = env.step(acted if acted is now else now.copy().update(acted))  # some return their outputs alone
     now = env.step_mdp(stepped)
     seen = now.copy()  # the reward is shown to the score, but is not part of the next step's input
     for key in env.reward_keys:

@@ -13,6 +13,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, is_leaf_nontensor,
 from torch import Tensor, nn
 from torchrl.data import Composite
 from torchrl.envs import (
+    ActionScaling,
     BatchSizeTransform,
     CatFrames,
     Compose,
@@ -122,10 +123,12 @@ def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> E
     for number, transform in enumerate(transforms):
         _check_transform(transform, transforms[number + 1 :])
         copy = Transform.clone(transform) if share else transform.clone()
+        first = (0,) * env.batch_dims
         if isinstance(copy, TensorDictPrimer) and copy.primers.shape == env.batch_size:
             # It adds the batch of its environment to its specs, but can't replace another one.
-            first = (0,) * len(env.batch_size)
             copy.primers = copy.primers[first] if first else copy.primers.clone()
+        if isinstance(copy, ActionScaling) and copy.initialized and copy.loc.shape[: len(first)] == env.batch_size:
+            copy.loc, copy.scale = copy.loc[first], copy.scale[first]
         if isinstance(copy, VecNorm | VecNormV2) and not share:
             copy.freeze()
         copies.append(copy)
@@ -178,14 +181,15 @@ def branched_specs(policy: Any, own: torch.Size, shape: torch.Size) -> Iterator[
     changed = []
     for module in policy.modules() if isinstance(policy, nn.Module) else ():
         spec = vars(module).get("_spec")
-        if own and isinstance(spec, Composite) and spec.shape[: len(own)] == own:
+        leaves = [*filter(None, spec.values(True, True))] if isinstance(spec, Composite) else []
+        if own and leaves and all(leaf.shape[: len(own)] == own for leaf in leaves):
             changed.append((module, spec))
-            module._spec = _expanded(spec, own, shape)
+            vars(module)["_spec"] = _expanded(spec, own, shape)
     try:
         yield
     finally:
         for module, spec in changed:
-            module._spec = spec
+            vars(module)["_spec"] = spec
 
 
 def check_branching(env: EnvBase, state: TensorDictBase | None = None) -> None:

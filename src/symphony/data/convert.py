@@ -439,9 +439,10 @@ def merge(paths: Sequence[Path], out: Path, progress: Told = lambda *_: None, mi
         raise DataError("exists already; choose another folder", file=out)
     stores = [SegmentStore(path) for path in paths]
     for store in stores:
-        if twice := seen.intersection(store.ids):
-            raise DataError(TWICE, file=store.path, segment=min(twice))
-        seen.update(store.ids)
+        for names in (store.ids, [name + resampling.MIRRORED for name in store.ids] if mirror else []):
+            if twice := seen.intersection(names):
+                raise DataError(TWICE, file=store.path, segment=min(twice))
+            seen.update(names)
         if store.unfinished is not None:
             raise DataError(store.unfinished, file=store.path)
         report = Report.from_json(store.report).after(report)

@@ -22,7 +22,7 @@ from symphony.data.segment import RunSegment
 from symphony.data.selection import exclusion
 from symphony.data.sources.sumo import KINDS, crop_rule, generate_run, is_own, kind_name, sumo_version
 from symphony.data.store import SegmentStore
-from symphony.data.store_format import HEADER
+from symphony.data.store_format import HEADER, PARTIAL
 from symphony.data.store_writer import StoreWriter
 from symphony.errors import ConfigError, DataError
 from symphony.parallel import Engine, ordered_map
@@ -218,11 +218,13 @@ def generate(
 
     Raises:
         ConfigError: the store is being made with other arguments; names the first that differs.
-        DataError: ``out`` holds something else, SUMO is not installed, or the networks give no segments.
+        DataError: ``out`` holds something else, SUMO is missing, networks give no segments, or roads are damaged.
     """
     settings = plan.settings()
     if (Path(out) / HEADER).is_file() and (state := _begun(SegmentStore(out), settings)).complete:
         return state
+    if (folder := Path(out).with_name(Path(out).name + PARTIAL)).is_dir():
+        raise DataError(f"an unfinished conversion to that name lies in {folder}", file=Path(out))
     with StoreWriter(out, append=True) as writer:
         state = _begun(SegmentStore(out), settings)
         if state.complete:  # another run went on with it in between
@@ -237,6 +239,8 @@ def generate(
                     # A network under way when a run was killed is made again: what exists of it is skipped.
                     if len(writer) < plan.segments and not writer.has(segment.segment_id):
                         writer.append(segment, tags={"kind": result.task.kind, "network": result.task.name})
+                if result.error and is_own(result.task.kind) and state.networks < len(plan.kinds):
+                    raise DataError(result.error, file=result.task.kind)
                 state.add(result, len(writer) == plan.segments)
                 _report(writer, settings, state)
                 progress(len(writer), state)

@@ -16,6 +16,8 @@ from symphony.data.segment import STATES, Bools, Polylines, RunSegment, jumps, l
 
 LATE = 1.0  # seconds after the first step within which an ego may come: then the segment begins there
 PLACE = schema.MAX_COORDINATE, schema.MAX_COORDINATE, schema.MAX_HEIGHT
+MOVING = 3.0  # m/s, covered or logged, above which speeds are compared
+OFF_MAP = 100.0  # metres between an ego and the lanes from which on they may be of two places
 MARGIN = 10.0  # metres beside the lanes that are kept within which the boundary is kept, too
 
 NO_SIZE = "an agent left out: a box without a size"
@@ -56,8 +58,29 @@ def oddities(segment: RunSegment) -> list[str]:
         "a heading that has turned more than 4 times": largest(s.heading[seen]) > 8 * np.pi,
         "a map that reaches beyond 5 km": max(map(largest, points)) > 5_000,
         "lights known for less than half of the time (see --hold-lights)": ((lit > 0) & (lit < 0.5)).any(),
+        "velocities of vehicles that are not those of their positions": not 0.8 <= _speed_ratio(s) <= 1.25,
+        f"an ego over {OFF_MAP:g} m away from the lanes": _off_map(s) > OFF_MAP,
     }
     return [what for what, applies in found.items() if applies]
+
+
+def _speed_ratio(s: RunSegment) -> float:
+    """Return how many times their logged speed vehicles that move cover in a second: the median, 1 for none."""
+    lag = int(np.clip(round(1 / s.dt), 1, s.num_steps - 1))
+    both = s.valid[:, lag:] & s.valid[:, :-lag] & (s.agent_type == schema.AgentType.VEHICLE)[:, None]
+    way = (s.position[:, lag:, :2] - s.position[:, :-lag, :2])[both] / (lag * s.dt)
+    logged = (s.velocity[:, lag:] + s.velocity[:, :-lag])[both] / 2
+    covered, told = np.linalg.norm(way, axis=-1), np.linalg.norm(logged, axis=-1)
+    fast = np.maximum(covered, told) > MOVING
+    return float(np.median(covered[fast] / np.maximum(told[fast], 1e-3))) if fast.any() else 1.0
+
+
+def _off_map(s: RunSegment) -> float:
+    """Return the metres, in the median, between the ego and the rectangle around the lanes; 0 without lanes."""
+    place, lanes = s.position[s.ego, s.valid[s.ego], :2], s.road.lanes.points[:, :2]
+    if not len(lanes) or not len(place):
+        return 0.0
+    return float(np.median(np.linalg.norm(place - np.clip(place, lanes.min(0), lanes.max(0)), axis=-1)))
 
 
 def _lines(segment: RunSegment) -> RunSegment:

@@ -27,6 +27,7 @@ SLOW, FAST = 1.0, 2.0  # m/s between which the heading goes over from the logged
 LOST = "frames lost in the recording, up to 1 s of them filled in between"
 UNEVEN = "frames at uneven times, brought to even ones"
 REPEATED = "frames left out: not after those before them"
+MIRRORED = "-mirrored"  # what follows the id of a segment that is mirrored
 
 
 def resample(segment: RunSegment, dt: float) -> RunSegment:
@@ -70,7 +71,7 @@ def hold_lights(segment: RunSegment) -> RunSegment:
 
 
 def mirrored(segment: RunSegment) -> RunSegment:
-    """Return the segment mirrored at the x axis, where who kept right keeps left, under a name of its own."""
+    """Return the segment mirrored at the x axis, where who kept right keeps left: another one of its recording."""
 
     def flipped(points: NDArray[Any]) -> NDArray[Any]:
         return points * np.array([1, -1, 1], points.dtype)[: points.shape[-1]]
@@ -82,7 +83,7 @@ def mirrored(segment: RunSegment) -> RunSegment:
     road = replace(road, left_neighbors=road.right_neighbors, right_neighbors=road.left_neighbors)
     changed = {name: flipped(getattr(segment, name)) for name in ("position", "velocity", "signal_point", "origin")}
     goal = segment.goal and flipped(np.array(segment.goal)).tolist()
-    name, group = (f"{name}-mirrored" for name in (segment.segment_id, segment.group or segment.segment_id))
+    name, group = f"{segment.segment_id}{MIRRORED}", segment.group or segment.segment_id
     return segment.replace(segment_id=name, group=group, road=road, heading=-segment.heading, goal=goal, **changed)
 
 

@@ -70,15 +70,16 @@ def displacement_step(state: States, displacement: Float[Tensor, "*#b 2"], lengt
     The rear axle, half a wheelbase r behind the centre, is dragged along (a tractrix, dheading = sin(phi) / r
     per metre at an angle phi between motion and heading), here by the implicit midpoint rule: a turn of
     atan(y / (r + x / 2)). So heading errors die out instead of swinging, and a step too small to have a direction
-    hardly turns the agent. Reversing turns it as the step sideways alone would.
+    hardly turns the agent. Reversing, at a negative speed, turns it as the step sideways alone would.
     """
     forward, left = displacement.unbind(-1)
     distance = (forward.square() + left.square() + 1e-12).sqrt()
+    speed = torch.where(forward < 0, -distance, distance) / dt
     arm = 0.5 * WHEELBASE * length
     # Not atan2, whose last bit on the CPU depends on an element's place in the batch.
     turn = torch.atan(left / (arm + 0.5 * forward.clamp_min(0.0)))
     moved = state[..., :2] + rotate(displacement, state[..., 2])
-    return torch.cat([moved, (state[..., 2] + turn)[..., None], (distance / dt)[..., None]], dim=-1)
+    return torch.cat([moved, (state[..., 2] + turn)[..., None], speed[..., None]], dim=-1)
 
 
 def displacement_inverse(state: States, after: States) -> Float[Tensor, "*b 2"]:

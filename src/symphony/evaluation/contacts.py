@@ -26,6 +26,7 @@ from symphony.geometry import box_corners, boxes_overlap, levels_apart, meeting_
 from symphony.geometry.boxes import covers, relation
 from symphony.metrics import CollisionKind, meetings
 from symphony.metrics.kinds import STANDING, kind_of_contact
+from symphony.roadgraph.graph import turn_between
 from symphony.saved.rollouts import World
 
 STILL = 0.05  # speed in m/s up to which an agent that is hit has stopped, so that nothing is its fault (as in nuPlan)
@@ -157,7 +158,7 @@ def at_fault(world: World, found: Contacts, lanes: Lanes, offroad: Bools, lights
     # Pedestrians change no lanes.
     driving = ends & (segment.agent_type[front] != AgentType.PEDESTRIAN)
     cut_in = np.zeros(len(kind), bool)
-    cut_in[driving] = _cut_in(world, rear[driving], front[driving], found.step[driving], segment.dt)
+    cut_in[driving] = _cut_in(world, rear[driving], front[driving], found.step[driving], lanes)
     across = np.isin(kind, [CollisionKind.CROSSING, CollisionKind.ONCOMING])
     since = found.step[:, None] - lights.step
     recent = (since >= 0) & (since <= RED_SECONDS / segment.dt)
@@ -165,6 +166,8 @@ def at_fault(world: World, found: Contacts, lanes: Lanes, offroad: Bools, lights
     reaching = _reaching(me, it, lanes) | offroad[me.row, found.step]
     backing = (me.speed < -STILL) & (face == _REAR)
     beside = np.isin(kind, [CollisionKind.ONCOMING, CollisionKind.SIDESWIPE])
+    # They are in no lane, or one of their own.
+    on_foot = np.isin(segment.agent_type[it.row], [AgentType.PEDESTRIAN, AgentType.CYCLIST])
     # The first that holds decides.
     rules = (
         (red, True),
@@ -176,7 +179,7 @@ def at_fault(world: World, found: Contacts, lanes: Lanes, offroad: Bools, lights
         (np.abs(it.speed) <= STANDING, True),
         (behind, True),
         (beside & reaching, True),
-        (beside & _reaching(it, me, lanes), False),
+        (beside & _reaching(it, me, lanes) & ~on_foot, False),
         (face == _FRONT, True),
         (face == _SIDE, reaching),
     )
@@ -221,30 +224,59 @@ def _reaching(me: _Party, it: _Party, lanes: Lanes) -> Bools:
     """Return whether an agent is in no lane, reaches over the edge of its lane towards the other, or over the far
     edge on its way in [E].
     """
-    graph, lane = lanes.graph, lanes.lane_of(me.position, me.heading, me.height)
-    found = np.ones(len(lane), bool)
-    inside = lane >= 0
-    number = np.searchsorted(graph.usable_lanes, lane[inside])
-    lines, here = graph.index.geometry[number], me.position[inside]
+    mine, theirs = (_place(party.position, party.heading, party.size, lanes, party.height) for party in (me, it))
+    towards = ((it.position - me.position) * mine.left).sum(-1)
+    # Two that meet on one line are on the sides on which their lanes are.
+    lane = ((theirs.middle - mine.middle) * mine.left).sum(-1)
+    side = np.sign(np.where(mine.inside & theirs.inside & (np.abs(lane) > _EDGE), lane, towards))
+    off = side * mine.off
+    coming = side * (me.velocity * mine.left).sum(-1) > ENTERING
+    return ~mine.inside | (off > mine.reach) | (coming & (off < -mine.reach))
+
+
+class _Place(NamedTuple):
+    """Where agents [n] are in the lanes nearest to them; 0 for those in none."""
+
+    inside: Bools  # whether there is one
+    middle: Reals  # [n, 2] the nearest point of its centre line
+    left: Reals  # [n, 2] to the left of it, a unit vector
+    off: Reals  # metres that the agent is to the left of it
+    reach: Reals  # metres that the agent may be off it for its box to be within it, by :data:`_EDGE`
+    onward: Reals  # the direction of the lane, or of its first successor, :data:`_AHEAD` metres on
+
+
+def _place(position: Reals, heading: Reals, size: Reals, lanes: Lanes, height: Heights) -> _Place:
+    graph, lane = lanes.graph, lanes.lane_of(position, heading, height)
+    found = _Place(lane >= 0, *np.zeros((2, len(lane), 2)), *np.zeros((3, len(lane))))
+    inside = np.flatnonzero(found.inside)
+    number, here = np.searchsorted(graph.usable_lanes, lane[inside]), position[inside]
+    lines = graph.index.geometry[number]
     along = shapely.line_locate_point(lines, shapely.points(here))
     way = graph.index.heading(number, along)
-    nearest = shapely.get_coordinates(shapely.line_interpolate_point(lines, along))
     left = np.stack([-np.sin(way), np.cos(way)], -1)
-    turn = me.heading[inside] - way
-    covered = 0.5 * (np.abs(np.stack([np.sin(turn), np.cos(turn)], -1)) * me.size[inside]).sum(-1)
-    side = np.sign(((it.position[inside] - here) * left).sum(-1))
-    off = side * ((here - nearest) * left).sum(-1)
-    coming = side * (me.velocity[inside] * left).sum(-1) > ENTERING
-    reach = 0.5 * lanes.width[lane[inside]] + _EDGE - covered
-    found[inside] = (off > reach) | (coming & (off < -reach))
+    turn = heading[inside] - way
+    covered = 0.5 * (np.abs(np.stack([np.sin(turn), np.cos(turn)], -1)) * size[inside]).sum(-1)
+    found.middle[inside] = shapely.get_coordinates(shapely.line_interpolate_point(lines, along))
+    found.left[inside], found.off[inside] = left, ((here - found.middle[inside]) * left).sum(-1)
+    found.reach[inside] = 0.5 * lanes.width[lane[inside]] + _EDGE - covered
+    after = np.array([next(iter(graph.successors[each]), each) for each in lane[inside].tolist()], np.int64)
+    rest = along + _AHEAD - graph.length[lane[inside]]
+    number = np.where(rest > 0, np.searchsorted(graph.usable_lanes, after), number)
+    found.onward[inside] = graph.index.heading(number, np.where(rest > 0, rest, along + _AHEAD))
     return found
 
 
-def _cut_in(world: World, rear: Indices, front: Indices, step: Indices, dt: float) -> Bools:
+def _placed(world: World, row: Indices, step: Indices, lanes: Lanes) -> _Place:
+    height = None if world.height is None else world.height[row, step]
+    return _place(world.position[row, step], world.heading[row, step], world.size[row], lanes, height)
+
+
+def _cut_in(world: World, rear: Indices, front: Indices, step: Indices, lanes: Lanes) -> Bools:
     """Return whether the one ahead came into the path of the one behind shortly before their contact, nearer than is
-    safe [E]. The path is the one driven, so that nobody cuts in because the one behind turns or changes lanes.
+    safe [E]. The path is the one driven, and nobody cuts in who keeps to its lane while the one behind leaves one, or
+    turns less than it where two lanes merge.
     """
-    times = np.maximum(step[:, None] + np.arange(-math.ceil(CUT_IN_SECONDS / dt) - 1, 0), 0)
+    times = np.maximum(step[:, None] + np.arange(-math.ceil(CUT_IN_SECONDS / lanes.segment.dt) - 1, 0), 0)
     ours, theirs = world.position[rear[:, None], times], world.position[front[:, None], times]
     seen = world.valid[rear[:, None], times]
     heading, last = world.heading[rear[:, None], times], world.heading[rear, step]
@@ -267,4 +299,19 @@ def _cut_in(world: World, rear: Indices, front: Indices, step: Indices, dt: floa
     # Beyond this many metres the one behind can stop (RSS).
     faster = behind + RESPONSE * SPEED_UP
     travel = behind * RESPONSE + 0.5 * SPEED_UP * RESPONSE**2 + faster**2 / (2 * BRAKE_LEAST)
-    return outside.any(1) & (gap < np.maximum(travel - ahead**2 / (2 * BRAKE_MOST), 0.0))
+    close = gap < np.maximum(travel - ahead**2 / (2 * BRAKE_MOST), 0.0)
+    there = _placed(world, front, step, lanes)
+    onward = np.where(there.inside, there.onward, world.heading[front, step])
+    before = times[np.arange(len(rear)), np.maximum(entered - 1, 0)]
+    turns, other_turns = (turn_between(world.heading[row, before], onward) for row in (front, rear))
+    kept, other_kept = (_kept(world, row, times, lanes) for row in (front, rear))
+    return outside.any(1) & close & ~(kept & (~other_kept | (turns <= other_turns)))
+
+
+def _kept(world: World, row: Indices, times: Indices, lanes: Lanes) -> Bools:
+    """Return whether agents [E] keep within lanes while they are there, at times [E, W], or there are no lanes."""
+    seen = world.valid[row[:, None], times]
+    place = _placed(world, np.broadcast_to(row[:, None], times.shape)[seen], times[seen], lanes)
+    out = np.zeros(seen.shape, bool)
+    out[seen] = ~place.inside | (np.abs(place.off) > place.reach)
+    return np.asarray(~out.any(1) if len(lanes.graph.usable_lanes) else np.ones(len(row), bool))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import from_numpy
 
 from symphony.data.levels import levels_of
-from symphony.data.segment import GREEN, RED, RunSegment, wrap
+from symphony.data.segment import GREEN, RED, RunSegment, SignalState, wrap
 from symphony.geometry import levels_apart
 from symphony.geometry.polylines import stations_along
 from symphony.metrics.kinds import STANDING
@@ -37,7 +37,7 @@ PAST_END = 5.0  # metres from the end of a route beyond which an agent has gone 
 SECONDS = 3.0  # for which an agent must stand on a free road to block it
 FREE = 15.0  # metres ahead of the front without other agents and without a light other than green
 CROSSING = 25.0  # metres within which others that move across are given way to
-ASIDE = 0.5  # metres beside its box that an agent wants to be free
+ASIDE = 0.5  # metres beside its box that an agent wants to be free, and that it may reach into a lane
 _FOLLOWED = 3.0  # metres from a centre line, on average, within which a path follows the lane
 _PASSED = 5.0  # metres that the front may be past a stop point and still wait for its light
 _LANE = 2.5  # metres aside within which a light is that of an agent's lane
@@ -61,6 +61,12 @@ class Lanes:
         """Return the lane on its level that each agent [n] is in, see :func:`symphony.roadgraph.lane_of`."""
         keep = None if height is None else lambda near: self._kept(near, height)
         return lane_of(self.graph, position, heading, keep=keep)
+
+    @cached_property
+    def lit(self) -> bool:
+        """Whether any light of a lane that has a length is ever known."""
+        state = self.segment.signal_state[self.graph.length[self.segment.signal_lane] > 0]
+        return bool((state != SignalState.UNKNOWN).any())
 
     @cached_property
     def light_height(self) -> NDArray[np.float32]:
@@ -168,8 +174,8 @@ def wrong_way(world: World, evaluated: Indices, lanes: Lanes) -> Bools:
 
 def blocking(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Bools:
     """Return [M, U] when evaluated agents block traffic: stand (:data:`symphony.metrics.kinds.STANDING`) in a lane
-    that goes on, for :data:`SECONDS` or more, while nobody is in their way ahead or crosses it, no light ahead is
-    other than green, and the log, where it has the agent, moves. All this is on their level.
+    that goes on, along or across it, for :data:`SECONDS` or more, while nobody is in their way ahead or crosses it,
+    no light ahead is other than green, and the log, where it has the agent, moves. All this is on their level.
     """
     segment = lanes.segment
     within = slice(start, start + world.valid.shape[1])
@@ -182,7 +188,7 @@ def blocking(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Bool
         return found
     row = evaluated[who]
     height = None if world.height is None else world.height[row, step]
-    free = _goes_on(lanes, world.position[row, step], world.heading[row, step], height)
+    free = _goes_on(lanes, world.position[row, step], world.heading[row, step], world.size[row], height)
     free &= _nobody_ahead(world, row, step, height) & _green(world, row, step, lanes, start, height)
     found[who[free], step[free]] = True
     return _long(found, segment.dt)
@@ -205,14 +211,15 @@ def _seen_from(world: World, row: Indices, step: Indices, points: Reals) -> tupl
     return cos * x + sin * y - 0.5 * world.size[row, :1], cos * y - sin * x
 
 
-def _goes_on(lanes: Lanes, position: Reals, heading: Reals, height: Heights) -> Bools:
-    """Return whether agents [E] are in lanes that go on for a while."""
-    graph, lane = lanes.graph, lanes.lane_of(position, heading, height)
-    found, inside = lane >= 0, np.flatnonzero(lane >= 0)
-    lines = graph.index.geometry[np.searchsorted(graph.usable_lanes, lane[inside])]
-    left = graph.length[lane[inside]] - shapely.line_locate_point(lines, shapely.points(position[inside]))
+def _goes_on(lanes: Lanes, position: Reals, heading: Reals, size: Reals, height: Heights) -> Bools:
+    """Return whether boxes [E] reach :data:`ASIDE` metres or more into lanes that go on for a while."""
+    graph, found = lanes.graph, np.zeros(len(position), bool)
+    near = lanes.near(position, 0.5 * size.max(initial=0) + 0.5 * lanes.width.max(initial=0), height)
+    lane, turn = graph.usable_lanes[near.line], near.heading - heading[near.point]
+    covered = 0.5 * (np.abs(np.stack([np.sin(turn), np.cos(turn)], -1)) * size[near.point]).sum(-1)
     follows = np.array([len(after) > 0 for after in graph.successors], bool)
-    found[inside] = follows[lane[inside]] | (left > FREE)
+    goes_on = follows[lane] | (graph.length[lane] - near.along > FREE)
+    found[near.point[goes_on & (near.distance < 0.5 * lanes.width[lane] + covered - ASIDE)]] = True
     return found
 
 

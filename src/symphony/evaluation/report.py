@@ -182,7 +182,7 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
             "collision_at_states": bool(hits.at_state.any()),
             "at_fault_collision": bool(fault.any()),
             "collisions": len(hits.agent),
-            "red_lights": len(lights.agent) if len(segment.signal_lane) else None,
+            "red_lights": len(lights.agent) if lanes.lit else None,
             "offroad_time": _percent(off[rows], steps * (len(segment.road.boundary) > 0)),
             "wrong_way_time": _percent(driving.wrong_way(world, rows, lanes)[:, 1:] & counted, lane_steps),
             "blocking_time": _percent(stands[rows, 1:] & counted, lane_steps),
@@ -210,7 +210,7 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
                 seconds = segment.dt * int(counted[:, begin - 1 : max(stop - 1, 0)].sum())
                 part["seconds"] += seconds
                 part["edged"] += seconds * (len(segment.road.boundary) > 0)
-                part["lit"] += seconds * (len(segment.signal_lane) > 0)
+                part["lit"] += seconds * lanes.lit
                 part["offroad"] += segment.dt * int(off[rows, within].sum())
                 for kind, step in (("collisions", hits.step), ("red_lights", lights.step)):
                     part[kind] += int(((step >= begin) & (step < stop)).sum())

@@ -8,6 +8,7 @@ import re
 import shlex
 from collections.abc import Callable, Mapping, Set
 from functools import partial
+from modulefinder import ModuleFinder
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,8 @@ _PLACE = re.compile(" at 0x[0-9A-Fa-f]+")
 
 
 def source_of(planner: str | Callable[..., Any]) -> str:
-    """Return a digest of the file that a planner is written in, and of the values bound to it: by
-    ``functools.partial``, as attributes of an object, or as variables of an enclosing function.
+    """Return a digest of the file that a planner is written in, of modules beside it that it imports, and of values
+    bound to it: by ``functools.partial``, as attributes of an object, or as variables of an enclosing function.
 
     For a command, it covers the program that is started, if that is a file, and the first other word that is a file.
     It is empty for planners that come with the package, and where no source is known.
@@ -93,11 +94,22 @@ def _code_of(given: Any) -> str:
     if module is None or module.__name__.partition(".")[0] == "symphony":
         return ""
     if getattr(module, "__file__", None) is not None:
-        return _digest(str(module.__file__))
+        return _sources(str(module.__file__))
     try:  # of a notebook, say
         return _short(inspect.getsource(given).encode())
     except (OSError, TypeError):
         return ""
+
+
+def _sources(file: str) -> str:
+    """Return the digest of a module and of those beside it that it imports, without running them."""
+    finder = ModuleFinder([str(Path(file).parent)])
+    try:
+        finder.run_script(file)
+    except (OSError, SyntaxError):
+        return _digest(file)
+    found = sorted(filter(None, (getattr(each, "__file__", None) for each in finder.modules.values())))
+    return _digest(file) if len(found) < 2 else _short("".join(map(_digest, found)).encode())
 
 
 def _short(data: bytes) -> str:

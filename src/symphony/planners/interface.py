@@ -44,7 +44,7 @@ FARTHEST = 1e5  # metres from the origin that a trajectory may come to, as saved
 
 
 class Pose(NamedTuple):
-    """The state of the ego at the next step: box centre, heading, speed along it."""
+    """The state of the ego at the next step: box centre, heading, speed along it (see :func:`checked_plan`)."""
 
     x: float
     y: float
@@ -327,7 +327,8 @@ def _fixed_road(road: RoadMap) -> RoadMap:
 
 
 def checked_plan(plan: Any, state: NDArray[Any], dt: float) -> Reals:
-    """Return the plan of a planner as 2 or 4 finite numbers: of a trajectory, its first state.
+    """Return the plan of a planner as 2 or 4 finite numbers: of a trajectory, its first state. It gets the speed of
+    its way if it names one that :data:`MAX_BRAKING` within the step does not explain.
 
     Args:
         plan: as the planner returned it.
@@ -357,4 +358,6 @@ def checked_plan(plan: Any, state: NDArray[Any], dt: float) -> Reals:
         raise ValueError(f"a trajectory past {FARTHEST:g} m from the origin")
     if abs(target[2]) > MAX_HEADING:
         raise ValueError(f"a heading of {target[2]:g} rad, at most {MAX_HEADING:g} are possible")
-    return target
+    way = target[:2] - state[:2]
+    speed = math.copysign(away / dt, way @ (math.cos(target[2]), math.sin(target[2])))
+    return target if abs(target[3] - speed) <= MAX_BRAKING * dt + 0.1 else np.array([*target[:3], speed])

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -77,7 +78,7 @@ def save(figure: Any, path: Path) -> None:
     """Write a figure, creating the folder it goes into."""
     # Without the date, equal pictures are equal files.
     undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
-    with replacing(path) as draft:
+    with replacing(path) as draft, mpl.rc_context({"svg.hashsalt": "symphony"}):
         figure.savefig(draft, metadata=undated.get(path.suffix[1:].lower()))
 
 

@@ -73,7 +73,7 @@ def run_program(name: str, arguments: str, folder: Path) -> None:
     except subprocess.TimeoutExpired as error:
         raise SymphonyError(f"{name} took more than {TIMEOUT_SECONDS:g} s") from error
     if done.returncode < 0:
-        raise SymphonyError(f"{name} was killed by signal {-done.returncode} (out of memory?)")
+        raise SymphonyError(f"{name} {arguments}: killed by signal {-done.returncode} (out of memory? a bad file?)")
     if done.returncode != 0:
         raise DataError(f"{name} failed with exit status {done.returncode}:\n{done.stderr[-4000:].strip()}")
     # On a full disk they end as if all were well, with files that are cut off.
