@@ -279,7 +279,8 @@ def test_a_lane_that_ends_inside_the_map_says_so():
 @pytest.mark.parametrize("size", [1e-7, 1e-38])
 def test_lanes_of_next_to_no_length_in_a_circle(size):
     road, name = crossing()
-    lines = [road.lanes[k][:, :2].copy() for k in range(len(road.lanes))]
+    end = road.lanes[name["in0"]][-1, :2]
+    lines = [road.lanes[k][:, :2] - end for k in range(len(road.lanes))]
     tiny = np.array([[0, 0], [size, 0]], np.float32)
     lines += [tiny, tiny[::-1]]
     a, b = len(lines) - 2, len(lines) - 1
@@ -290,7 +291,12 @@ def test_lanes_of_next_to_no_length_in_a_circle(size):
     assert all(follows(graph, route.lanes) for route in found)
     ordinary = [route for route in found if a not in route.lanes]
     assert ordinary == routes(LaneGraph(road), [(name["in0"], 10.0)])
-    assert all(np.isfinite(route_line(graph, route, 10.0)).all() for route in found)
+
+
+@given(st.floats(0, 20))
+def test_a_link_across_what_the_map_lacks_leads_nowhere(gap):
+    graph = LaneGraph(make_road([np.float32([[0, 0], [50, 0]]), np.float32([[50 + gap, 0], [99, 0]])], [(0, 1)]))
+    assert len(graph.successors[0]) == len(graph.predecessors[1]) == (np.float32(50 + gap) <= 55)
 
 
 def test_going_around_the_block_first_is_not_the_way_of_the_log():

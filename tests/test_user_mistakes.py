@@ -133,11 +133,11 @@ def test_a_command_is_what_it_starts_and_what_that_reads(tmp_path: Path) -> None
         script.write_text(text)
         found += [source_of(f"pipe:{sys.executable} {script}"), source_of(f"pipe:python {script}")]
     assert len(set(found)) == 4
-    script.write_text("import beside_mine\ndef plan(seen): return 0.0, 0.0\n")
-    for text in ("A = 1", "A = 2"):
-        (tmp_path / "beside_mine.py").write_text(text)
-        found.append(source_of(f"{script}:plan"))
-    assert len(set(found)) == 6
+    texts = {"served": "A = 1\n", "held": "import served\ndef plan(seen): ...\n", "mine": "from held import plan\n"}
+    for name, text in [*texts.items(), *texts.items()]:
+        (tmp_path / f"{name}.py").write_text(text + "\n" * len(found))
+        found += [source_of(f"{script}:plan")] if len(found) > 4 or name == "mine" else []
+    assert len(set(found)) == 8  # by the file that names it, the one that holds it, and what that imports
     assert source_of(f"pipe:{sys.executable} -c '{'#' * 300}'") == source_of(f"pipe:{sys.executable} -c ''")
 
 

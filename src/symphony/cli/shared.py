@@ -65,6 +65,8 @@ class SimulationOptions(Command):
 def check_search(agent: symphony.Agent, config: EvaluateConfig) -> None:
     """Raise a ConfigError for an option that has no effect on the search with which an agent is simulated."""
     kind = agent.plan(config).kind
+    if config.logged_goals and agent.goals is None:
+        raise errors.ConfigError(f"--logged-goals has no effect: {agent.name} follows none")
     for name in {"tree": (), "backtrack": evaluation.OF_TREES}.get(kind, evaluation.OF_SEARCHES):
         if getattr(config, name) != getattr(EvaluateConfig, name):
             raise errors.ConfigError(f"--{name.replace('_', '-')} has no effect on search '{kind}': see --search")

@@ -34,8 +34,8 @@ SEARCHES = 600
 """Searches in a row from which on compiling their steps pays off on a device: each saves some .4 s."""
 MOST_SECONDS = 1e6
 """Seconds that a planner can be given for an answer, at most."""
-OF_TREES = ("branches", "trees", "rule", "temperature")
-OF_SEARCHES = (*OF_TREES, "prune_every", "threshold")
+OF_TREES = ("branches", "trees", "rule", "temperature", "goals")
+OF_SEARCHES = (*OF_TREES, "prune_every", "threshold", "score")
 """Settings that have an effect on trees alone, and on any search."""
 
 

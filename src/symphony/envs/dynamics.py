@@ -131,9 +131,7 @@ class Bicycle:
         return self.num_acceleration * self.num_steering
 
     def grid(self, like: Float[Tensor, "*_"]) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
-        """Return acceleration and steering of every joint action, in the dtype and on the device of ``like``. They
-        are shared and must not be changed in place.
-        """
+        """Return acceleration and steering of every joint action, like ``like``; they are shared, so unchanged."""
         acceleration, steering = self._joint
         return constant(acceleration, like.dtype, like.device), constant(steering, like.dtype, like.device)
 

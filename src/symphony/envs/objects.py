@@ -151,9 +151,7 @@ def _height(
 def rollout_heights(
     scenes: SceneBatch, state: Float[Tensor, "B K T N 4"], scene: Int[Tensor, " B"] | None = None
 ) -> Float[Tensor, "B K T N 2"] | None:
-    """Return height and level of the interactive agents in states of rollouts, of all or some rows of the scenes;
-    None where no scene has levels.
-    """
+    """Return height and level of interactive agents in states of rollouts; None where no scene has levels."""
     if not scenes.agent_height.shape[1]:
         return None
     row = torch.arange(len(scenes), device=state.device) if scene is None else scene

@@ -166,8 +166,7 @@ def at_fault(world: World, found: Contacts, lanes: Lanes, offroad: Bools, lights
     reaching = _reaching(me, it, lanes) | offroad[me.row, found.step]
     backing = (me.speed < -STILL) & (face == _REAR)
     beside = np.isin(kind, [CollisionKind.ONCOMING, CollisionKind.SIDESWIPE])
-    # They are in no lane, or one of their own.
-    on_foot = np.isin(segment.agent_type[it.row], [AgentType.PEDESTRIAN, AgentType.CYCLIST])
+    on_foot = np.isin(segment.agent_type[it.row], [AgentType.PEDESTRIAN, AgentType.CYCLIST])  # in no lane
     # The first that holds decides.
     rules = (
         (red, True),
@@ -221,9 +220,7 @@ def _face(me: _Party, it: _Party) -> Indices:
 
 
 def _reaching(me: _Party, it: _Party, lanes: Lanes) -> Bools:
-    """Return whether an agent is in no lane, reaches over the edge of its lane towards the other, or over the far
-    edge on its way in [E].
-    """
+    """Return whether agents [E] are in no lane, reach over its edge to the other, or over the far one, coming."""
     mine, theirs = (_place(party.position, party.heading, party.size, lanes, party.height) for party in (me, it))
     towards = ((it.position - me.position) * mine.left).sum(-1)
     # Two that meet on one line are on the sides on which their lanes are.

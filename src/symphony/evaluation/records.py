@@ -102,18 +102,22 @@ def _filled_in(agent: Agent, result: Evaluation) -> dict[str, Any]:
 def evaluation_name(record: dict[str, Any]) -> str:
     """Return the name of an evaluation among those of its run; it is equal for equal data and settings only."""
     config, data = record["config"], record["data"]
-    store = re.sub(r"[^A-Za-z0-9._]+", "_", data["name"])[:60] or "store"
+    store = _plain(data["name"])[:60] or "store"
     parts = [store, data["checksum"][:12], *_search_words(config), f"{config['interactive']}agents"]
     parts += [f"{config['duration']}s"] if config["duration"] else []
     parts += [f"{config['rollouts']}rollouts", f"seed{config['seed']}"]
     parts += [f"step{record['run']['checkpoint']}"] if record["run"]["named"] else []
     parts += _unusual_words(config)
-    parts += [re.sub(r"[^A-Za-z0-9._]+", "_", path) for path in config.get("metric", ())]
+    parts += [_plain(path) for path in config.get("metric", ())]
     parts += [f"wosac{record['wosac']['config']}"] if "wosac" in record else []
     name = "-".join(parts)
     if len(name) > _LONGEST:
         name = f"{name[: _LONGEST - 13]}-{hashlib.sha256(name.encode()).hexdigest()[:12]}"
     return name
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9._]+", "_", name)
 
 
 def simulation_way(config: Mapping[str, Any]) -> str:
@@ -123,7 +127,7 @@ def simulation_way(config: Mapping[str, Any]) -> str:
 
 def _search_words(config: Mapping[str, Any]) -> list[str]:
     words = [config["search"]]
-    words += [f"{config['trees']}x{config['branches']}", config["rule"]] if config["trees"] else []
+    words += [f"{config['trees']}x{config['branches']}", _plain(config["rule"])] if config["trees"] else []
     words += [f"every{config['prune_every']}"] if config.get("prune_every") else []
     return words + ([f"at{config['temperature']:g}"] if config.get("temperature") else [])
 

@@ -36,11 +36,13 @@ from symphony.roadgraph import LaneGraph, lane_of
 
 IN_LANE = 1.0
 """Metres from a centre line within which a standing vehicle is taken to wait rather than to be parked."""
+FOLLOWS = 2.0
+"""Metres between log and fit up to which a step is a demonstration."""
 
-VERSION = 7
+VERSION = 8
 """Version of the fit: raised when it gives other numbers or routes for the same segment (a test says when)."""
 PACKAGE = Path(symphony.__file__).parent
-_TENSORS = ("agent", "states", "actions", "valid", "error", "progress")
+_TENSORS = ("agent", "states", "actions", "valid", "progress")
 
 TOGETHER = 256
 """Vehicles fitted at a time: more would save few calls, and their temporaries would leave the cache."""
@@ -54,8 +56,7 @@ class Experts:
         agent: [K] rows of the segment's agents.
         states: [K, T, 4] fitted x, y, heading, speed.
         actions: [K, T - 1] int16 or [K, T - 1, 2].
-        valid: [K, T - 1] where the log is valid before and after the action.
-        error: [K] metres between the last valid fitted and logged position.
+        valid: [K, T - 1] where the log is valid before and after the action, and the fit near it.
         progress: [K, T] metres that each has come along its route; [K, 0] where routes were not asked for.
         routes: feasible routes of each expert from its first valid state; empty where not asked for.
     """
@@ -64,7 +65,6 @@ class Experts:
     states: Tensor
     actions: Tensor
     valid: Tensor
-    error: Tensor
     progress: Tensor
     routes: tuple[RouteTable, ...] = ()
 
@@ -97,10 +97,9 @@ def fit_experts(
     fits = _fit(segments, rows, dynamics)
     found = []
     for segment, graph, chosen, (actions, states) in zip(segments, graphs, rows, fits, strict=True):
-        mask = torch.from_numpy(segment.valid[chosen])
-        last = mask.shape[1] - 1 - mask.flip(1).int().argmax(1)
-        which = torch.arange(len(chosen))
-        away = states[which, last, :2] - torch.from_numpy(segment.position[chosen, last.numpy(), :2])
+        # Where no actions follow the log, as a track begins with a wrong velocity, nothing is learned.
+        away = torch.linalg.norm(states[..., :2] - torch.from_numpy(segment.position[chosen][..., :2]), dim=-1)
+        mask = torch.from_numpy(segment.valid[chosen]) & (away <= FOLLOWS)
         tables = tuple(route_table(segment, graph, int(row)) for row in chosen) if routes else ()
         come = np.zeros((len(chosen), 0), np.float32)
         if routes:
@@ -108,8 +107,7 @@ def fit_experts(
             path, there = states[..., :2].numpy(), np.maximum.accumulate(segment.valid[chosen], 1)
             come = logged_progress(tables, path, there)
         known = mask[:, 1:] & mask[:, :-1]
-        progress, error = torch.from_numpy(come), away.norm(dim=-1)
-        found.append(Experts(torch.from_numpy(chosen), states, actions, known, error, progress, tables))
+        found.append(Experts(torch.from_numpy(chosen), states, actions, known, torch.from_numpy(come), tables))
     return found
 
 

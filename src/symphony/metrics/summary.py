@@ -32,9 +32,7 @@ def curvature_histogram(curvature: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def jensen_shannon(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the Jensen-Shannon divergence [...] of histograms [..., K], in nats (0 to ln 2); NaN if one is empty. It
-    is the divergence itself, not its square root.
-    """
+    """Return the Jensen-Shannon divergence (no root) [...] of histograms [..., K] in nats; NaN if one is empty."""
     counts = [np.asarray(each, dtype=np.float64) for each in (first, second)]
     totals = [each.sum(-1, keepdims=True) for each in counts]
     p, q = (np.divide(c, t, out=np.full_like(c, np.nan), where=t > 0) for c, t in zip(counts, totals, strict=True))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import inspect
 import re
 import shlex
+import sys
 from collections.abc import Callable, Mapping, Set
 from functools import partial
-from modulefinder import ModuleFinder
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +25,8 @@ _PLACE = re.compile(" at 0x[0-9A-Fa-f]+")
 
 
 def source_of(planner: str | Callable[..., Any]) -> str:
-    """Return a digest of the file that a planner is written in, of modules beside it that it imports, and of values
-    bound to it: by ``functools.partial``, as attributes of an object, or as variables of an enclosing function.
+    """Return a digest of the files that a planner is written in and named by, of modules beside them that these
+    import, and of values bound to it: by ``functools.partial``, as attributes, or as variables around a function.
 
     For a command, it covers the program that is started, if that is a file, and the first other word that is a file.
     It is empty for planners that come with the package, and where no source is known.
@@ -46,7 +48,7 @@ def source_of(planner: str | Callable[..., Any]) -> str:
     else:
         held = getattr(getattr(given, "__self__", given), "__dict__", {})
     bound += _content(held) if held else ""
-    code = _code_of(given)
+    code = _code_of(given, planner.rpartition(":")[0] if isinstance(planner, str) else "")
     return _short((code + bound).encode()) if bound else code
 
 
@@ -89,27 +91,41 @@ def _content(value: Any, inside: tuple[int, ...] = ()) -> str:
     return f"{type(value).__qualname__}({', '.join(parts)})"
 
 
-def _code_of(given: Any) -> str:
+def _code_of(given: Any, named: str) -> str:
+    """Return the digest of the code of an object and of the module by whose name it was asked for."""
     module = inspect.getmodule(given)
     if module is None or module.__name__.partition(".")[0] == "symphony":
         return ""
-    if getattr(module, "__file__", None) is not None:
-        return _sources(str(module.__file__))
+    modules = module, sys.modules.get(named), sys.modules.get(str(Path(named).resolve()))
+    if files := {Path(file).resolve() for each in modules if (file := getattr(each, "__file__", None))}:
+        parts = sorted(_sources(files))
+        return parts[0] if len(parts) == 1 else _short("".join(parts).encode())
     try:  # of a notebook, say
         return _short(inspect.getsource(given).encode())
     except (OSError, TypeError):
         return ""
 
 
-def _sources(file: str) -> str:
-    """Return the digest of a module and of those beside it that it imports, without running them."""
-    finder = ModuleFinder([str(Path(file).parent)])
-    try:
-        finder.run_script(file)
-    except (OSError, SyntaxError):
-        return _digest(file)
-    found = sorted(filter(None, (getattr(each, "__file__", None) for each in finder.modules.values())))
-    return _digest(file) if len(found) < 2 else _short("".join(map(_digest, found)).encode())
+def _sources(files: set[Path]) -> set[str]:
+    """Return digests of files and, without running them, of what they import from their folder or package."""
+    found, todo = dict[Path, str](), [*files]
+    while todo:
+        file = todo.pop()
+        found[file] = _digest(str(file))
+        top = next((folder for folder in file.parents if not (folder / "__init__.py").is_file()), file.parent)
+        own = file.parent if top == file.parent else top / file.relative_to(top).parts[0]
+        try:
+            nodes = [*ast.walk(ast.parse(file.read_bytes()))]
+        except (OSError, SyntaxError, ValueError):
+            continue
+        for node in (one for one in nodes if isinstance(one, ast.Import | ast.ImportFrom)):
+            module, level = getattr(node, "module", None) or "", getattr(node, "level", 0)
+            places = [file.parents[level - 1]] if level else [file.parent, top]
+            for place, name in product(places, [module, *(f"{module}.{alias.name}" for alias in node.names)]):
+                stem = place.joinpath(*name.strip(".").split("."))
+                each = [one for one in (stem.parent / f"{stem.name}.py", stem / "__init__.py") if one.is_file()]
+                todo += [one for one in each if own in one.parents and one not in found]
+    return {*found.values()}
 
 
 def _short(data: bytes) -> str:

@@ -56,9 +56,7 @@ LEAD = 2.0  # seconds before the first event of a run at which its replay begins
 
 
 def report_page(found: Mapping[str, Any], viewer: str | None = "view.html") -> str:
-    """Return one self-contained page of what the report writes; ``viewer`` is the address of the page that plays the
-    rollouts, relative to this one, None for none.
-    """
+    """Return one self-contained page of a report; ``viewer`` is the address of the page that plays rollouts."""
     runs = found["per_run"]
     parts = {
         "/*TITLE*/": escape(f"{found['agent']}: report"),

@@ -83,9 +83,7 @@ def save(figure: Any, path: Path) -> None:
 
 
 def view_around(points: NDArray[Any], margin: float = 20.0, least: float = 70.0) -> View:
-    """Return a rectangle around points [P, 2] with a margin, the longer side at least ``least`` metres, the shorter
-    at least 0.6 of it.
-    """
+    """Return a rectangle around points [P, 2] with a margin, ``least`` metres long or more, 0.6 of that wide."""
     points = points[np.isfinite(points).all(-1)]
     if len(points) == 0:
         points = np.zeros((1, 2))

@@ -150,11 +150,13 @@ def visited_regions(
 def visited_curvatures(
     graph: LaneGraph, position: NDArray[Any], heading: NDArray[Any], valid: NDArray[np.bool_]
 ) -> Reals:
-    """Return average curvatures, 1/m, of all regions visited by any of the trajectories, one entry per visit. Shapes
-    as in :func:`visited_regions`.
+    """Return average curvatures, 1/m, of all regions visited by any of the trajectories, one entry per visit: a lane
+    that is one of several choices counts once. Shapes as in :func:`visited_regions`.
     """
     visited = visited_regions(graph, position, heading, valid)
-    return graph.regions.curvature[np.nonzero(visited)[-1]]
+    row, region = np.nonzero(visited.reshape(math.prod(visited.shape[:-1]), -1 if visited.size else 0))
+    _, first = np.unique(np.stack([row, graph.regions.lane[region]]), axis=1, return_index=True)
+    return graph.regions.curvature[region[np.sort(first)]]
 
 
 def _states_on(

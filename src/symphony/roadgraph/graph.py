@@ -86,6 +86,7 @@ def turn_between(a: Reals, b: Reals) -> Reals:
     return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi)
 
 
+FAR = 5.0  # metres between lanes from which on a link says that the map lacks what is between them: none leads there
 BIKE_LANE = 3  # the lane type that vehicles keep off (see ``LaneType``)
 
 
@@ -136,8 +137,12 @@ class LaneGraph:
         self.arc = [arc_lengths(line) for line in self.lines]
         self.length: Reals = np.array([arc[-1] for arc in self.arc], dtype=np.float64)
         self.usable: Bools = (np.asarray(road.lane_type) != BIKE_LANE) & (self.length > 0)
-        self.successors = self._adjacency(road.successors, "road.successors")
-        self.predecessors = self._adjacency(np.asarray(road.successors)[:, ::-1], "road.successors")
+        after = self._adjacency(road.successors, "road.successors")
+        links = np.array([(lane, k) for lane, each in enumerate(after) for k in each], np.int64).reshape(-1, 2)
+        ends = shapely.points(np.array([self.lines[lane][-1] for lane in links[:, 0]]).reshape(-1, 2))
+        links = links[shapely.distance(ends, line_strings([self.lines[k] for k in links[:, 1]])) <= FAR]
+        self.successors = self._adjacency(links, "road.successors")
+        self.predecessors = self._adjacency(links[:, ::-1], "road.successors")
         self.left = self._adjacency(road.left_neighbors, "road.left_neighbors")
         self.right = self._adjacency(road.right_neighbors, "road.right_neighbors")
         headings = [np.arctan2(*np.diff(line, axis=0).T[::-1]) for line in self.lines]

@@ -143,9 +143,7 @@ def _changes(graph: LaneGraph, plain: Sequence[Route], along: dict[int, float], 
 
 
 def _change_at(graph: LaneGraph, lane: int, other: int, start: float) -> tuple[float, float] | None:
-    """Return metres along a lane, from ``start`` on, at which a change to another begins, and metres along that one;
-    None where the two are not side by side.
-    """
+    """Return metres along two lanes at which a change begins, from ``start`` on; None if not side by side."""
     line, target = graph.lines[lane], graph.lines[other]
     begins = max(start, paths.beside(line, target[0])[0])
     if begins > graph.length[lane] - paths.CLOSE:

@@ -167,6 +167,8 @@ def crowd_dataset(
         # Vehicles without a driver don't enter.
         inflow = config.inflow if rule or agent.policy is not None else 0.0
         onward = Onward(inflow, config.lights, config.seed) if config.duration and in_open else None
+        if onward is None and (config.inflow or config.lights):
+            raise ConfigError("--inflow and --lights are for open traffic beyond the log: see --duration")
     crowd = Crowd(count, everyone, config.radius, in_open, rule, config.others == "idm", tuple(also), onward)
     seconds, keep = config.duration or agent.duration, config.batch or TOGETHER
     routes = agent.routed or routes

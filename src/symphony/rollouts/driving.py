@@ -182,9 +182,7 @@ class _Goals(NamedTuple):
         return torch.cat([followed[..., :along], goal[..., along:]], -1)
 
     def renewed(self, state: TensorDictBase, attempt: Int[Tensor, " R"]) -> TensorDictBase:
-        """Return first states of lines that went back, with other goals: where the likely ones have led to trouble
-        again and again, others are tried.
-        """
+        """Return first states of lines that went back, with other goals, unlikely ones where others failed."""
         if self.network is None or self.config.logged_goals:
             return state
         heat = (attempt - FIRST_TRIES).clamp_min(1)[:, None].float()

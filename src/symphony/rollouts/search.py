@@ -100,9 +100,7 @@ def rule_score(env: DrivingEnv, state: TensorDictBase) -> Float[Tensor, "*b N"]:
 def realism_score(
     env: DrivingEnv, discriminator: TensorDictModuleBase | None, *, score: Score = "discriminator", planned: int = 0
 ) -> Callable[[TensorDictBase], Tensor]:
-    """Return a function that scores states [..., N], by the discriminator or by what agents do; 0 for background
-    agents and the first ``planned`` agents.
-    """
+    """Return a function that scores states [..., N]; 0 for background agents and the first ``planned`` ones."""
     learned = KeyScore(keys.SCORE, discriminator, valid_key=keys.VALID) if score == "discriminator" else None
 
     def of_scored(state: TensorDictBase) -> Float[Tensor, "*b N"]:

@@ -35,9 +35,7 @@ class UnexpectedError(DataError):
 
 
 class Reader(ABC):
-    """Turns the files of one format into run segments at the log's own rate. A segment whose ``group`` a reader
-    leaves empty is a group of its own.
-    """
+    """Turns files of one format into run segments at the log's rate; without a ``group`` they are their own."""
 
     name: ClassVar[str]  # name of the format, also :attr:`RunSegment.source`
     patterns: ClassVar[tuple[str, ...]]  # file-name patterns the format's files go by, for searching a folder

@@ -63,9 +63,7 @@ class Rows:
 
 
 def read_rows(path: Path) -> Rows:
-    """Read a track file. A :class:`DataError` names file and line if it is too large, empty or cut short, or lacks a
-    column or valid field.
-    """
+    """Read a track file; a :class:`DataError` names file and line if it is too large, cut or lacks a field."""
     size = path.stat().st_size
     refuse(size > MAX_BYTES, f"{size} bytes, at most {MAX_BYTES} can be read", file=path)
     with located(file=path, field="a line"), path.open("rb") as file:

@@ -230,9 +230,7 @@ def _aligned(left: Way, right: Way) -> tuple[Way, Way, tuple[bool, bool]]:
 
 
 def _area(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> shapely.Polygon | None:
-    """Return a place for vehicles that has no direction, such as a parking lot; None for others. Its participants say
-    who may be there, else its subtype.
-    """
+    """Return a place for vehicles without a direction (a parking lot) by its participants or subtype, or None."""
     named = {name: value for name, value in tags.items() if name.startswith("participant:")}
     allowed = any(n.startswith("participant:vehicle") and value == "yes" for n, value in named.items())
     if not (allowed if named else tags.get("subtype") in _DRIVABLE):

@@ -190,9 +190,7 @@ def _mask(valid: Tensor, kind: Tensor, name: str) -> Tensor:
 
 
 def _ever(features: WosacFeatures, flag: str, *, vehicles: bool = False) -> tuple[Tensor, Tensor]:
-    """Return whether a flag is set at any step at which the log is valid, [E] of the log and [R, E] of the rollouts;
-    of vehicles alone, if asked for.
-    """
+    """Return whether a flag is set at a valid step, [E] of the log, [R, E] of rollouts; maybe of vehicles alone."""
     log, simulated = ((source[flag] & features.log_valid).any(-1) for source in (features.log, features.simulated))
     kind = (features.object_type == VEHICLE) | (not vehicles)
     return log & kind, simulated & kind

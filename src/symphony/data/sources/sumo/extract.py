@@ -166,9 +166,7 @@ def _cut(
 def _interest(
     position: Doubles, heading: Doubles, velocity: Doubles, valid: Bools, drives: Bools, rule: CropRule
 ) -> Doubles:
-    """Return [A] chance of being the ego, 0 without another that drives near by: turns, closeness and changes of
-    speed count.
-    """
+    """Return [A] the chance to be the ego, 0 with nobody near by: turns, closeness and changes of speed count."""
     distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
     distance = np.where(valid[:, None] & valid[None], distance, np.inf)
     distance[np.arange(len(position)), np.arange(len(position))] = np.inf
