@@ -91,10 +91,10 @@ class DiscriminatorLoss(MaskedLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss of a batch that holds :attr:`in_keys`; the input is left as it is."""
-        training = torch.is_grad_enabled()
-        penalised = bool(self.gradient_penalty)
+        training, penalised = torch.is_grad_enabled(), bool(self.gradient_penalty)
         # The penalty takes a gradient, also where its caller wants none.
-        with torch.set_grad_enabled(training or penalised):
+        inference = torch.is_inference_mode_enabled() and not penalised
+        with torch.inference_mode(inference), torch.set_grad_enabled(training or penalised):
             inputs = tensordict.select(*self.discriminator.in_keys).detach()
             leaves = self._leaves(inputs) if penalised else []
             with self.discriminator_params.to_module(self.discriminator):
@@ -117,7 +117,7 @@ class DiscriminatorLoss(MaskedLoss):
     def _leaves(self, inputs: TensorDictBase) -> list[Float[Tensor, "*_"]]:
         """Return the inputs to differentiate by, put in place as leaves."""
         chosen = [key for key in self.discriminator.in_keys if inputs.get(key).is_floating_point()]
-        leaves = [inputs.get(key).detach().requires_grad_() for key in chosen]
+        leaves = [inputs.get(key).clone().detach().requires_grad_() for key in chosen]
         for key, leaf in zip(chosen, leaves, strict=True):
             inputs.set(key, leaf)
         return leaves
