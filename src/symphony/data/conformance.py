@@ -17,6 +17,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from symphony.data.odd import MOVING, spans, speed_ratios
 from symphony.data.segment import AgentType, Polylines, RunSegment, content_hash, validate, wrap
 from symphony.data.sources.base import Item, Reader, UnexpectedError
 from symphony.data.store import SegmentStore
@@ -25,8 +26,6 @@ from symphony.errors import DataError
 
 Doubles = NDArray[np.float64]
 
-MOVING = 3.0  # m/s above which speeds and headings are compared
-SPAN = 1.0  # seconds over which positions and velocities are compared: from step to step, positions jitter
 BESIDE = 2.5  # metres within which a moving vehicle should find a lane that runs its way, within 0.6 rad
 
 RANGES: dict[str, tuple[str, float, float, Any, str]] = {
@@ -174,18 +173,9 @@ def _moving(s: RunSegment) -> NDArray[np.bool_]:
 
 
 def _motion(s: RunSegment) -> dict[str, Any]:
-    velocity, position = s.velocity.astype(np.float64), s.position[..., :2].astype(np.float64)
-    lag = int(np.clip(round(SPAN / s.dt), 1, s.num_steps - 1))
-    means = np.cumsum((velocity[:, 1:] + velocity[:, :-1]) / 2, axis=1)
-    means = np.pad(means, ((0, 0), (1, 0), (0, 0)))
-    seen = np.pad(np.cumsum(s.valid, axis=1), ((0, 0), (1, 0)))
-    throughout: NDArray[np.bool_] = seen[:, lag + 1 :] - seen[:, : -lag - 1] == lag + 1
-    covered = ((position[:, lag:] - position[:, :-lag]) / (lag * s.dt))[throughout]
-    logged = ((means[:, lag:] - means[:, :-lag]) / lag)[throughout]
-    speed, told = np.hypot(*covered.T), np.hypot(*logged.T)
-    faster = np.maximum(speed, told)
-    fast = faster > MOVING
-    apart = np.hypot(*(covered - logged).T) > np.maximum(1.0, 0.3 * faster)
+    covered, logged = spans(s)
+    faster = np.maximum(np.hypot(*covered.T), np.hypot(*logged.T))
+    velocity = s.velocity.astype(np.float64)
     driving = _moving(s)
     course = np.arctan2(velocity[driving][:, 1], velocity[driving][:, 0])
     vehicles = s.size[s.agent_type == AgentType.VEHICLE]
@@ -193,8 +183,8 @@ def _motion(s: RunSegment) -> dict[str, Any]:
         "dt": s.dt,
         "ego_from_origin": np.linalg.norm(s.position[s.ego, np.argmax(s.valid[s.ego])]),
         "leftovers": sum(np.count_nonzero(array[~s.valid]) for array in (s.position, s.heading, s.velocity)),
-        "speed_ratio": speed[fast] / np.maximum(told[fast], 1e-6),
-        "speed_mismatch": apart[fast],
+        "speed_ratio": speed_ratios(covered, logged),
+        "speed_mismatch": np.hypot(*(covered - logged).T) > np.maximum(1.0, 0.3 * faster),
         "heading_mismatch": np.abs(wrap(course - s.heading[driving])) > 0.3,
         "vehicle_length": vehicles[:, 0],
         "vehicle_width": vehicles[:, 1],
