@@ -116,9 +116,7 @@ def hashed(td: TensorDictBase) -> TensorDictBase:
 
 
 class Mass(EnvBase):
-    """Points x' = x + 0.5 (v + action), whose episode is over beyond a limit; they can come back in, if not sticky.
-    There is one point, or several agents, which end separately.
-    """
+    """Points x' = x + 0.5 (v + action) that end beyond a limit, or come back if not sticky; agents end separately."""
 
     batch_locked = False
 

@@ -90,9 +90,7 @@ def forget(*packages: str) -> None:
 
 
 def share_the_server() -> None:
-    """Have workers of this process, started by :func:`apart`, forked from the same server (Linux): another would
-    take seconds. Not for processes that are killed, with which the server may end.
-    """
+    """Have workers of this process, which must not be killed, forked from the same server: another takes seconds."""
     if engine._START == "forkserver":
         forkserver._forkserver.ensure_running = forkserver.ensure_running = resource_tracker.ensure_running
 

@@ -101,9 +101,7 @@ def along(path: NDArray[Any], distance: NDArray[Any]) -> tuple[NDArray[Any], NDA
 
 
 def straight_road(num_agents=3, steps=51, dt=0.2, seed=0, num_lanes=3, **changes: Any) -> RunSegment:
-    """Cars at constant speeds (8-15 m/s, one per lane) on a one-way road along +x; nobody touches anybody. Lane 0 is
-    the rightmost, at y = 0. Agent k drives in lane k modulo ``num_lanes``.
-    """
+    """Cars at 8-15 m/s along +x that never touch, agent k in lane k modulo ``num_lanes``; 0 is right, at y = 0."""
     rng = np.random.default_rng(seed)
     rows = -(-num_agents // num_lanes)
     length = 60 + 25 * rows + 15 * steps * dt

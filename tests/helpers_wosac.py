@@ -18,9 +18,7 @@ META = SubmissionMeta(*MADE, authors=("A", "B"), affiliation="Nowhere")
 
 
 def made_scenario(agents: int = 4, seed: int = 0, **changes: Any) -> WosacScenario:
-    """Agents that drive along +x, each in its lane, at speeds of its own; the first two are scored. Two lanes, ids 7
-    and 8; on the first a signal at x = 30 that is red from step 20 on.
-    """
+    """Agents that drive along +x in lanes 7 and 8, the first two scored; a signal at x = 30, red from step 20."""
     rng = np.random.default_rng(seed)
     step = np.arange(91) * 0.1
     speed = 5 + rng.random((agents, 1)) * 5

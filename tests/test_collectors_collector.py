@@ -314,9 +314,7 @@ def test_bound_classes_are_classes_that_can_be_pickled():
 
 
 def test_collectors_and_objectives_stand_alone():
-    """They import TorchRL, nothing private of it, jaxtyping, each their own, and nothing else of this package but how
-    a step becomes one program, which stands alone, too.
-    """
+    """They import TorchRL, nothing private of it, jaxtyping, each their own, and how a step becomes one program."""
     allowed = {"torch", "tensordict", "torchrl", "jaxtyping", *sys.stdlib_module_names}
     for package in ("collectors", "objectives", "programs"):
         for source in (ROOM / package).glob("*.py") if package != "programs" else [ROOM / "programs.py"]:

@@ -377,9 +377,7 @@ def test_lights_stand_where_their_lane_enters_the_junction(driven: list[RunSegme
 
 
 def test_nobody_drives_over_a_red_light(driven: list[RunSegment]) -> None:
-    """Few cross the line while their light shows red: none that was red for the last two seconds. Who waits at it
-    starts when it is green, not before.
-    """
+    """Nobody crosses the line of a light that was red for two seconds; who waits at it starts when it is green."""
     crossings = offences = waited = 0
     for s in driven:
         along = np.stack([np.cos(s.heading), np.sin(s.heading)], -1)

@@ -17,7 +17,7 @@ from helpers_roadgraph import arc, crossing, drive, fork, graph_of, make_road, r
 from helpers_segments import along
 from symphony.errors import DataError
 from symphony.geometry.polylines import NEAR, earliest_pass, stations_along
-from symphony.roadgraph import LaneGraph, lane_of, starting_lanes, visited_regions
+from symphony.roadgraph import LaneGraph, lane_of, starting_lanes, visited_curvatures, visited_regions
 
 
 def test_regions_of_a_crossing():
@@ -32,6 +32,13 @@ def test_regions_of_a_crossing():
     assert regions.curvature[right] == pytest.approx(-1 / 8, rel=0.05)
     np.testing.assert_allclose(regions.entry[left], [10, 2], atol=1e-5)
     assert abs(regions.entry_heading[ahead]) == pytest.approx(np.pi)
+
+
+def test_a_lane_of_several_choices_counts_once():
+    ends = np.array([[[0, 0], [50, 0]], [[0, 3], [50, 0]], [[50, 0], [90, 0]], [[50, 0], [90, 20]]], float)
+    road, path = make_road(dict(zip("abcd", ends, strict=True)), ["ac", "ad", "bc", "bd"])[0], np.arange(90.0)
+    driven = LaneGraph(road), np.stack([path, 0 * path], -1), 0 * path, path >= 0
+    assert (visited_regions(*driven).sum(), visited_curvatures(*driven).tolist()) == (2, [0])
 
 
 @settings(max_examples=25, deadline=None)

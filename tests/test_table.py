@@ -263,7 +263,7 @@ def test_names_differ_with_everything_that_changes_results() -> None:
 def test_names_are_file_names_and_differ_however_long_they_are(store: str, paths: int) -> None:
     """An evaluation of hours was lost where its name was too long for a file."""
     metric = [f"measures.of.comfort.{part}:{part}_of_all_agents" for part in range(paths)]
-    records = (make_record(metric=[*metric, last]) for last in ("x:y", "x:z"))
+    records = (make_record(metric=[*metric, k], trees=1, branches=2, rule=f"{store}.py:R") for k in ("x:y", "x:z"))
     names = {evaluation_name(record | {"data": {"name": store, "checksum": "ab" * 32}}) for record in records}
     assert len(names) == 2
     assert all(re.fullmatch(r"[A-Za-z0-9._-]{1,200}", name) for name in names)

@@ -168,10 +168,14 @@ def test_a_folder_is_not_gone_on_with_by_another_simulation(store: Path, run: Pa
     assert (code, "differs in settings.goals" in words) == (1, True)
 
 
-@pytest.mark.parametrize("command", ["evaluate", "simulate --out sim"])
-def test_an_option_without_effect_is_refused(told: Any, store: Path, command: str) -> None:
-    code, words = told(*command.split(), "pretrained:bc_ts_h", "--data", store, "--branches", 8)
-    assert (code, "--branches has no effect on search 'backtrack'" in words) == (1, True)
+@pytest.mark.parametrize(("words", "why"), [
+    ("evaluate pretrained:bc_ts_h --branches 8", "--branches has no effect on search 'backtrack'"),
+    ("evaluate pretrained:bc_rl --logged-goals", "--logged-goals has no effect: pretrained:bc_rl follows none"),
+    ("simulate pretrained:bc_rl --out sim --lights 9 3 2", "are for open traffic beyond the log: see --duration"),
+])  # fmt: skip
+def test_an_option_without_effect_is_refused(told: Any, store: Path, words: str, why: str) -> None:
+    code, printed = told(*words.split(), "--data", store)
+    assert (code, why in printed) == (1, True)
 
 
 @pytest.mark.parametrize(("words", "message"), [

@@ -21,7 +21,7 @@ import torch
 from torch import from_numpy
 
 from symphony.data.segment import AgentType
-from symphony.evaluation.driving import Bools, Heights, Indices, Lanes, Lights, Reals
+from symphony.evaluation.driving import Bools, Heights, Indices, Lanes, Lights, Reals, half_across
 from symphony.geometry import box_corners, boxes_overlap, levels_apart, meeting_time, pose_at
 from symphony.geometry.boxes import covers, relation
 from symphony.metrics import CollisionKind, meetings
@@ -251,8 +251,7 @@ def _place(position: Reals, heading: Reals, size: Reals, lanes: Lanes, height: H
     along = shapely.line_locate_point(lines, shapely.points(here))
     way = graph.index.heading(number, along)
     left = np.stack([-np.sin(way), np.cos(way)], -1)
-    turn = heading[inside] - way
-    covered = 0.5 * (np.abs(np.stack([np.sin(turn), np.cos(turn)], -1)) * size[inside]).sum(-1)
+    covered = half_across(heading[inside] - way, size[inside])
     found.middle[inside] = shapely.get_coordinates(shapely.line_interpolate_point(lines, along))
     found.left[inside], found.off[inside] = left, ((here - found.middle[inside]) * left).sum(-1)
     found.reach[inside] = 0.5 * lanes.width[lane[inside]] + _EDGE - covered
@@ -270,8 +269,8 @@ def _placed(world: World, row: Indices, step: Indices, lanes: Lanes) -> _Place:
 
 def _cut_in(world: World, rear: Indices, front: Indices, step: Indices, lanes: Lanes) -> Bools:
     """Return whether the one ahead came into the path of the one behind shortly before their contact, nearer than is
-    safe [E]. The path is the one driven, and nobody cuts in who keeps to its lane while the one behind leaves one, or
-    turns less than it where two lanes merge.
+    safe [E]. The path is the one driven, and nobody cuts in who keeps to lanes and turns no more than the one behind:
+    neither before one that changes lanes nor, on the straighter one, where two merge.
     """
     times = np.maximum(step[:, None] + np.arange(-math.ceil(CUT_IN_SECONDS / lanes.segment.dt) - 1, 0), 0)
     ours, theirs = world.position[rear[:, None], times], world.position[front[:, None], times]
@@ -301,8 +300,7 @@ def _cut_in(world: World, rear: Indices, front: Indices, step: Indices, lanes: L
     onward = np.where(there.inside, there.onward, world.heading[front, step])
     before = times[np.arange(len(rear)), np.maximum(entered - 1, 0)]
     turns, other_turns = (turn_between(world.heading[row, before], onward) for row in (front, rear))
-    kept, other_kept = (_kept(world, row, times, lanes) for row in (front, rear))
-    return outside.any(1) & close & ~(kept & (~other_kept | (turns <= other_turns)))
+    return outside.any(1) & close & ~(_kept(world, front, times, lanes) & (turns <= other_turns))
 
 
 def _kept(world: World, row: Indices, times: Indices, lanes: Lanes) -> Bools:

@@ -194,6 +194,11 @@ def blocking(world: World, evaluated: Indices, lanes: Lanes, start: int) -> Bool
     return _long(found, segment.dt)
 
 
+def half_across(turn: Reals, size: Reals) -> Reals:
+    """Return half of the metres [...] that boxes [..., 2], turned from a line, take up across it."""
+    return np.asarray(0.5 * (np.abs(np.stack([np.sin(turn), np.cos(turn)], -1)) * size).sum(-1))
+
+
 def _long(flags: Bools, dt: float) -> Bools:
     least = math.ceil(SECONDS / dt - 1e-6) + 1
     if flags.shape[1] < least:
@@ -216,7 +221,7 @@ def _goes_on(lanes: Lanes, position: Reals, heading: Reals, size: Reals, height:
     graph, found = lanes.graph, np.zeros(len(position), bool)
     near = lanes.near(position, 0.5 * size.max(initial=0) + 0.5 * lanes.width.max(initial=0), height)
     lane, turn = graph.usable_lanes[near.line], near.heading - heading[near.point]
-    covered = 0.5 * (np.abs(np.stack([np.sin(turn), np.cos(turn)], -1)) * size[near.point]).sum(-1)
+    covered = half_across(turn, size[near.point])
     follows = np.array([len(after) > 0 for after in graph.successors], bool)
     goes_on = follows[lane] | (graph.length[lane] - near.along > FREE)
     found[near.point[goes_on & (near.distance < 0.5 * lanes.width[lane] + covered - ASIDE)]] = True
@@ -226,9 +231,7 @@ def _goes_on(lanes: Lanes, position: Reals, heading: Reals, size: Reals, height:
 def _nobody_ahead(world: World, row: Indices, step: Indices, height: Heights) -> Bools:
     ahead, left = _seen_from(world, row, step, world.position[:, step].swapaxes(0, 1))
     turn = (world.heading[:, step] - world.heading[row, step]).T
-    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-    along = 0.5 * (cos * world.size[:, 0] + sin * world.size[:, 1])
-    across = 0.5 * (sin * world.size[:, 0] + cos * world.size[:, 1])
+    along, across = half_across(turn, world.size[:, ::-1]), half_across(turn, world.size)
     there = world.valid[:, step].T & (row[:, None] != np.arange(len(world.size)))
     if world.height is not None and height is not None:
         level = from_numpy(world.height[:, step].swapaxes(0, 1))
@@ -236,7 +239,8 @@ def _nobody_ahead(world: World, row: Indices, step: Indices, height: Heights) ->
     wide = 0.5 * world.size[row, 1][:, None] + ASIDE
     in_the_way = (ahead + along > 0) & (ahead - along < FREE) & (np.abs(left) - across < wide)
     moves = np.abs(world.speed[:, step].T) > STANDING
-    crossing = moves & (sin > math.sin(math.pi / 4)) & (np.hypot(ahead, left) < CROSSING) & (ahead > -along)
+    moves &= np.abs(np.sin(turn)) > math.sin(math.pi / 4)
+    crossing = moves & (np.hypot(ahead, left) < CROSSING) & (ahead > -along)
     return ~(there & (in_the_way | crossing)).any(1)
 
 
