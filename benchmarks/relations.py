@@ -32,6 +32,7 @@ from symphony.evaluation.table import (
 )
 from symphony.files import write_json
 from symphony.metrics.intervals import clustered_mean
+from symphony.metrics.summary import WEIGHTED
 
 CLEAR = 2.0
 """Standard errors by which a number must differ from its bound to differ clearly."""
@@ -113,7 +114,7 @@ def _check(one: Relation, before: Sequence[Entry], after: Sequence[Entry]) -> No
         value, error = clustered_mean(b - a, np.arange(len(names))) if known else (math.nan, math.nan)
     else:
         member, ((a,), (b,)) = segment_rows([before, after], [metric])
-        value, error = second - first, clustered_mean(b - a, member)[1]
+        value, error = clustered_mean(b - a, member)
         if isinstance(does, float):
             value = first / second if second else math.inf if first else math.nan
             error = clustered_mean((a - value * b) / second, member)[1] if second else math.nan
@@ -142,8 +143,10 @@ def by_method(entries: Sequence[Entry]) -> dict[str, list[Entry]]:
 def segment_rows(
     sides: Sequence[Sequence[Entry]], metrics: Sequence[str]
 ) -> tuple[NDArray[np.int64], list[NDArray[np.float64]]]:
-    """Return the recordings of the run segments [K] that all evaluations of two methods have, and for each method its
-    numbers of these segments [metrics, K], averaged over its evaluations.
+    """Return the recordings of the run segments [K] that all evaluations of two methods have, and for each method
+    parts [metrics, K] of which its numbers of these segments are the means, averaged over its evaluations.
+
+    Where longer segments weigh more a part is linearised: the number plus the weighted residual.
     """
     tables = []
     for entry in (entry for side in sides for entry in side):
@@ -154,10 +157,19 @@ def segment_rows(
     names = sorted(set.intersection(*(set(rows) for _, rows in tables)))
     if not names:
         raise ConfigError(f"{' and '.join(method_name(side[0].method) for side in sides)} share no run segment")
-    numbers = [[[entry.number(key, rows[name]) for name in names] for key in metrics] for entry, rows in tables]
+    numbers = [[_parts(entry, key, [rows[name] for name in names]) for key in metrics] for entry, rows in tables]
     groups = [str(tables[0][1][name].get("group") or name) for name in names]
     split = np.split(np.array(numbers), [len(sides[0])])
     return np.unique(groups, return_inverse=True)[1], [part.mean(0) for part in split]
+
+
+def _parts(entry: Entry, key: str, rows: Sequence[Any]) -> NDArray[np.float64]:
+    own = np.array([entry.number(key, row) for row in rows])
+    if key not in WEIGHTED:
+        return own
+    weight = np.array([entry.number(f"{key}_weight", row) for row in rows]) * np.isfinite(own)
+    number = np.nansum(own * weight) / max(weight.sum(), 1)
+    return number + weight * (own - number) / max(weight[weight > 0].mean(), 1) if weight.any() else own
 
 
 def paired_lines(entries: Sequence[Entry], base: str) -> list[str]:

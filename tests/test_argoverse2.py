@@ -18,6 +18,7 @@ from symphony.data.conformance import check_reader
 from symphony.data.segment import AgentType, LaneType, MarkType
 from symphony.data.sources import argoverse2, get_reader
 from symphony.data.sources.argoverse2 import EGO_ID, NO_AREA, NO_CROSSING, NO_LANE, NO_TYPE, NOMINAL_SIZES
+from symphony.data.sources.base import FROM_AXLE, from_rear_axle
 
 
 def test_tracks(tmp_path: Path) -> None:
@@ -26,7 +27,7 @@ def test_tracks(tmp_path: Path) -> None:
     assert (segment.dt, segment.num_steps, segment.current_step, segment.ego) == (0.1, 20, 7, 0)
     assert segment.agent_id.tolist() == [EGO_ID, 7, 8, 9, 101, 102]
     np.testing.assert_array_equal(segment.origin, [*np.round(FAR + np.array([15, 0])), 0])
-    place = segment.position[0] + segment.origin - [*FAR, 0]
+    place = segment.position[0] + segment.origin - [*FAR, 0] - [FROM_AXLE, 0, 0]
     np.testing.assert_allclose(place, np.stack([15 + np.arange(20), *np.zeros((2, 20))], -1), atol=1e-6)
     np.testing.assert_array_equal(segment.velocity[4], [[8, 0]] * 20)
     np.testing.assert_allclose(segment.heading[5], np.pi)
@@ -47,6 +48,25 @@ def test_tracks(tmp_path: Path) -> None:
     segment = read_one("argoverse2", write(tmp_path, columns))
     assert (segment.num_steps, segment.current_step, segment.dt) == (8, 7, 0.1)
     assert (segment.odd, segment.agent_type.tolist()) == ({NO_TYPE: "'tram'"}, [AgentType.OTHER])
+
+
+@given(st.floats(-0.5, 0.5), st.floats(0, 15), st.floats(-3, 3))
+def test_the_middle_of_a_recording_car_is_ahead_of_its_rear_axle(turn: float, speed: float, course: float) -> None:
+    """On a circle of any radius, its velocity is that of the place it moves to."""
+    angle = course + turn * 0.1 * np.arange(30)
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    between = angle - 0.05 * turn  # half a step before
+    axle = np.cumsum(0.1 * speed * np.stack([np.cos(between), np.sin(between)], axis=-1), axis=0)
+    states = np.concatenate([axle, angle[:, None], speed * along], axis=-1)
+    states[:, 2] = np.arctan2(*along.T[::-1])
+    valid = np.arange(30) % 11 > 0
+    found = from_rear_axle(states, range(5), valid, 0.1)
+    np.testing.assert_array_equal(found[~valid], states[~valid])
+    middle = axle + FROM_AXLE * along
+    np.testing.assert_allclose(found[valid, :3], np.c_[middle, states[:, 2]][valid], atol=1e-9)
+    moved = (middle[2:] - middle[:-2]) / 0.2
+    np.testing.assert_allclose(found[1:-1, 3:][valid[1:-1]], moved[valid[1:-1]], atol=0.02)
+    np.testing.assert_array_equal(from_rear_axle(states, range(5), np.arange(30) == 1, 0.1)[2:], states[2:])
 
 
 def test_lane_graph(tmp_path: Path) -> None:

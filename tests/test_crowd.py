@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from torchrl.envs.utils import step_mdp
 
 from helpers_agents import make_agent
-from helpers_segments import LANE_WIDTH, crossing, hide, make_road, make_segment
+from helpers_segments import LANE_WIDTH, crossing, hide, make_road, make_segment, turned
 from helpers_store import brief, stored
 from symphony import keys
 from symphony.agents import load_agent
@@ -23,11 +23,12 @@ from symphony.data.segment import AgentType
 from symphony.data.store import SegmentStore
 from symphony.envs import DrivingEnv, scene
 from symphony.envs.observation import ObservationConfig
-from symphony.envs.scene import SceneBatch, map_edge
+from symphony.envs.scene import SceneBatch, collate, map_edge
 from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
 from symphony.learning.demonstrations import SceneDataset
 from symphony.roadgraph import LaneGraph
+from symphony.rollouts import background
 from symphony.rollouts.control import given_goals
 from symphony.rollouts.crowd import Crowd, CrowdDataset, crowd_dataset
 from symphony.rollouts.driving import simulation
@@ -298,3 +299,14 @@ def test_a_goal_is_a_route_over_its_lane_or_past_its_point():
         asked(f"{name[0]}=lane:108", f"{name[0]}=lane:110")
     with pytest.raises(ConfigError, match="planner drives"):
         asked(f"{name[0]}=lane:108", planned=True)
+
+
+def test_speed_limits_of_drivers_are_those_of_the_nearest_lane_however_far_from_the_origin() -> None:
+    road = crossing(6).road
+    segment = crossing(6).replace(road=replace(road, speed_limit=np.arange(1, 1 + len(road.lanes), dtype=np.float32)))
+    places = torch.cartesian_prod(*2 * [torch.linspace(-60, 60, 61)])[None, None]
+    limits = []
+    for shift in ((0.0, 0.0), (16384.0, -8192.0)):
+        scenes = collate([scene(moved := turned(segment, 0.0, shift), [0, 1], LaneGraph(moved.road))])
+        limits.append(background._limits(scenes, places + torch.tensor(shift), 9.0))
+    assert (limits[0] != limits[1]).float().mean() < 0.002  # by rounding of the places

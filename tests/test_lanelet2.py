@@ -89,6 +89,8 @@ def test_the_direction_of_ways_does_not_matter(tmp_path: Path, turned: list[bool
     # The solid one is on the left of the way as drawn: it may be crossed from its other side.
     ({"type": "line_thin", "subtype": "solid_dashed"}, True, False),
     ({"type": "line_thin", "subtype": "dashed_solid"}, False, True),
+    ({"type": "line_thin", "subtype": "solid", "lane_change:left": "yes"}, True, False),
+    ({"type": "line_thin", "subtype": "dashed", "lane_change:left": "no"}, False, True),
 ])  # fmt: skip
 def test_lines_that_may_be_crossed(tags: dict[str, str], left: bool, right: bool, tmp_path: Path) -> None:
     for nodes, swap in (((3, 4), False), ((4, 3), True)):
@@ -99,6 +101,7 @@ def test_lines_that_may_be_crossed(tags: dict[str, str], left: bool, right: bool
 
 SPEEDS = {"50": 50 / 3.6, "50 km/h": 50 / 3.6, "25 mph": 25 * 0.44704, "8.5 m/s": 8.5, "8.5mps": 8.5}
 SPEEDS |= {"de274-60": 60 / 3.6, "us_r2-1-25": 25 * 0.44704, "none": np.nan, "": np.nan, "900": np.nan}
+SPEEDS |= {"de274.1": 30 / 3.6, "de310": 50 / 3.6, "de274": np.nan, "usR2-1": np.nan, "de274.1-20": 20 / 3.6}
 
 
 def test_speed_limits(tmp_path: Path) -> None:
@@ -106,6 +109,22 @@ def test_speed_limits(tmp_path: Path) -> None:
         rules = {202: ({"subtype": "speed_limit", "sign_type": text}, {})}
         content = osm(lanelets=LANELETS | {101: (22, 21, ROAD, (202,))}, rules=rules)
         np.testing.assert_allclose(road_of(tmp_path, content).speed_limit[0], expected, 1e-6)
+    sign = WAYS | {31: ((7, 8), {"type": "traffic_sign", "subtype": "de274-30"})}
+    rules = {202: ({"subtype": "speed_limit"}, {"refers": 31})}
+    content = osm(ways=sign, lanelets=LANELETS | {101: (22, 21, ROAD, (202,))}, rules=rules)
+    np.testing.assert_allclose(road_of(tmp_path, content).speed_limit[0], 30 / 3.6, 1e-6)
+
+
+@pytest.mark.parametrize(("tags", "expected"), [
+    ({}, LaneType.SURFACE_STREET), ({"participant:pedestrian": "no"}, LaneType.SURFACE_STREET),
+    ({"participant:vehicle:car": "yes", "subtype": "walkway"}, LaneType.SURFACE_STREET),
+    ({"participant:vehicle": "no"}, None), ({"participant:pedestrian": "yes"}, None),
+    ({"participant:pedestrian": "yes", "participant:bicycle": "yes"}, LaneType.BIKE_LANE),
+])  # fmt: skip
+def test_participants_overrule_subtypes(tmp_path: Path, tags: dict[str, str], expected: LaneType | None) -> None:
+    road = road_of(tmp_path, osm(lanelets=LANELETS | {103: (25, 24, ROAD | tags, ())}))
+    found = dict(zip(road.lane_id.tolist(), road.lane_type.tolist(), strict=True))
+    assert found.get(103) == expected
 
 
 @IN_FOLDER

@@ -35,6 +35,7 @@ from symphony.evaluation.report import Report, add_segment, report, total_number
 from symphony.evaluation.table import Entry, paper_figures
 from symphony.geometry import box_gap
 from symphony.metrics.intervals import clustered_mean
+from symphony.metrics.summary import WEIGHTED
 from symphony.rollouts.driving import playback
 from symphony.saved.folder import About, RolloutWriter, load_rollouts, save_rollouts
 from symphony.saved.rollouts import SavedRollouts, saved_rollouts, world_of
@@ -374,12 +375,14 @@ SEGMENTS = 12
 
 def filled(record: dict[str, Any], parts: float = 0.0, **means: float) -> dict[str, Any]:
     """A record whose segments scatter around the given means; noise is that of the segment, not of the method."""
-    noise, means = np.random.default_rng(0).uniform(0.5, 1.5, SEGMENTS), MEANS | means
+    rng, means = np.random.default_rng(0), MEANS | means
+    noise, steps = rng.uniform(0.5, 1.5, SEGMENTS), rng.integers(0, 20, SEGMENTS)
     means["collision_rate_at_states"] = means["collision_rate"]
-    rows = [
-        {"segment": f"s{k}", "group": f"g{k // 2}"} | {key: mean * n for key, mean in means.items()}
-        for k, n in enumerate(noise / noise.mean())
-    ]
+    rows: list[dict[str, Any]] = [{"segment": f"s{k}", "group": f"g{k // 2}"} for k in range(SEGMENTS)]
+    for key, mean in means.items():
+        weight = steps if key in WEIGHTED else np.ones(SEGMENTS)
+        for row, n, w in zip(rows, noise / np.average(noise, weights=weight), weight, strict=True):
+            row |= {key: mean * n if w else None, f"{key}_weight": float(w)}
     record |= means | {"per_segment": rows, "segments": len(rows)}
     record["curvature"] |= {"parts": {f"g{k}": parts + 0.001 * k for k in range(SEGMENTS // 2)}}
     return record
@@ -452,7 +455,7 @@ def test_paired_differences_are_over_what_both_have_and_over_recordings() -> Non
     def shifted(method: str, seed: int, shift: float) -> Entry:
         found = entry(method, seed)
         for row in found.record["per_segment"]:
-            row |= {key: value + shift for key, value in row.items() if key in MEANS or "states" in key}
+            row |= {key: row[key] + shift for key in (*MEANS, "collision_rate_at_states") if row[key]}
         return found
 
     (line,) = paired_lines([shifted("bc", 0, 0.0), shifted("bc", 1, 1.0), shifted("bc_h", 0, 2.5)], "bc")

@@ -19,12 +19,12 @@ from symphony.agents import load_agent
 from symphony.cli import main
 from symphony.config import EvaluateConfig
 from symphony.data.builtin import builtin_store
-from symphony.data.segment import AgentType, Polylines, RunSegment, SignalState, content_hash
+from symphony.data.segment import AgentType, Polylines, RunSegment, content_hash
 from symphony.data.sources.commonroad import CommonRoadReader
 from symphony.data.store import SegmentStore
 from symphony.errors import DataError
 from symphony.learning.demonstrations import SceneDataset
-from symphony.saved.export import as_json, commonroad
+from symphony.saved.export import commonroad
 from symphony.saved.folder import KEY, About, RolloutWriter, load_rollouts, read_tensors, tensors_of
 from symphony.saved.folder import save_rollouts as save_all
 from symphony.saved.rollouts import world_of
@@ -303,41 +303,24 @@ def test_agents_that_are_lost_and_odd_ids_stay_apart(tmp_path):
     assert late.there[0, :, 0].tolist() == [False, *[True] * 20]
 
 
-def test_json_says_who_is_the_ego_and_where_it_was_to_go():
-    segment = crossing(4, steps=11).replace(ego=2, origin=np.array([300.0, -20.0, 5.0]))
-    route = np.array([(0, 0, 0), (10, 5, 0)], np.float32)
-    saved = played(segment, [1, 2], goal=np.array([[-1, 1]]), routes=Polylines.of([route + 7, route]))
-    by_id = {agent["id"]: agent for agent in json.loads(as_json(saved, 0))["agents"]}
-    found = [by_id[int(number)] for number in segment.agent_id]
-    assert [agent["ego"] for agent in found] == [False, False, True, False]
-    routes = [agent.get("route", "none") for agent in found]
-    assert routes == ["none", None, [[300.0, -20.0], [310.0, -15.0]], "none"]
-    # A run that failed at once is a scenario without anybody.
+def test_a_run_that_failed_at_once_is_a_scenario_without_anybody():
     saved = played(straight_road(1), failed={0: "why"})
     saved.counted[:] = False
     assert "dynamicObstacle" not in commonroad(saved, 0)
-    assert json.loads(as_json(saved, 0))["agents"] == []
 
 
 def test_the_command_writes_a_file_for_each_rollout(tmp_path, capsys):
     saved = played(crossing(4, steps=11), [0, 1], 3, failed={1: "\udce9"})
     saved.collision[1, [4, 9], [1, 0]], saved.counted[1, 9, 0] = True, False
     save_all(tmp_path / "sim", About("made"), [saved, played(straight_road())])
-    sim, out = str(tmp_path / "sim"), tmp_path / "json"
+    sim, out = str(tmp_path / "sim"), tmp_path / "one"
     assert main(["export", sim]) == 0
     names = [path.name for path in sorted((tmp_path / "sim" / "export").iterdir())]
     assert names == [*(f"crossing-0-{k}.xml" for k in range(3)), "straight-0-0.xml"]
-    arguments = ["--format", "json", "--out", str(out), "--segments", "crossing-0", "--rollouts", "1", "1"]
+    arguments = ["--out", str(out), "--segments", "crossing-0", "--rollouts", "1", "1"]
     assert main(["export", sim, *arguments]) == 0
     assert "written: 1 file in" in capsys.readouterr().out
     (file,) = out.iterdir()
-    found, world = json.loads(file.read_text()), world_of(saved, 1)
-    states = np.array(found["agents"][1]["states"])
-    np.testing.assert_array_equal(states[:, 0], np.arange(11))
-    np.testing.assert_allclose(states[:, 1:3], world.position[1], atol=1e-6)
-    np.testing.assert_allclose(states[:, 4], world.speed[1], atol=1e-6)
-    assert [agent["collision"] for agent in found["agents"][:2]] == [[], [5]]  # what does not count is not told
-    assert [agent["driver"] for agent in found["agents"]] == ["made", "made", "playback", "playback"]
-    assert found["lights"][0]["states"][0] == SignalState(saved.segment.signal_state[0, 0]).name.lower()
+    assert file.read_text() == commonroad(saved, 1)
     assert main(["export", sim, "--rollouts", "1"]) == 1
     assert "straight-0 has rollouts 0 to 0, not 1" in capsys.readouterr().err

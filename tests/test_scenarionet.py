@@ -20,8 +20,10 @@ from helpers_scenarionet import FAR, STEPS, line, ring, scenario, track, write
 from helpers_segments import CHARACTERS
 from helpers_sources import off_road, read_error, read_one
 from symphony.data.convert import convert
+from symphony.data.levels import levels_of
 from symphony.data.segment import AgentType, LaneType, MarkType, SignalState
 from symphony.data.sources import safe_pickle
+from symphony.data.sources.base import FROM_AXLE
 from symphony.data.sources.safe_pickle import load_plain
 from symphony.data.store import SegmentStore
 from symphony.errors import DataError
@@ -36,7 +38,7 @@ def test_tracks(tmp_path: Path) -> None:
     assert (segment.agent_type.tolist(), segment.valid[0].tolist()) == (kinds, [k >= 3 for k in range(STEPS)])
     np.testing.assert_allclose(segment.size[[0, 3]], [(4.5, 2, 1.6), (0.7, 0.6, 1.8)], rtol=1e-6)
     np.testing.assert_array_equal(segment.origin, (*FAR, 0))
-    np.testing.assert_allclose(segment.position[1, 10], (10, 0, 0.9), rtol=1e-6)
+    np.testing.assert_allclose(segment.position[1, 10], (10 + FROM_AXLE, 0, 0.9), rtol=1e-6)
     np.testing.assert_allclose(segment.velocity[1], np.broadcast_to((10, 0), (STEPS, 2)))
 
 
@@ -108,6 +110,20 @@ def test_what_other_sources_say_about_the_map(tmp_path: Path) -> None:
     np.testing.assert_allclose(segment.signal_point, [(0, 0, 1), (60, 0, 0)])
     lights = [SignalState.STOP] * 10 + [SignalState.GO] * 5 + [SignalState.UNKNOWN] * (STEPS - 15)
     assert segment.signal_state.tolist() == [lights, STEPS * [SignalState.GO]]
+
+
+def test_a_boundary_without_heights_takes_them_from_the_lanes(tmp_path: Path) -> None:
+    """Of Argoverse 2 lanes have the city's height, and agents none."""
+    tree = changed("metadata/dataset", "av2")
+    features = tree["map_features"]
+    for name in ("right", "left", "on", "end"):
+        features[name]["polyline"] = np.pad(features[name]["polyline"], ((0, 0), (0, 1)), constant_values=20.0)
+        features[name].pop("polygon", None)
+    del features["boundary_0"], features["boundary_1"]
+    assert levels_of(read_one("scenarionet", write(tmp_path, tree))).flat
+    features["edge"] = {"type": "ROAD_EDGE_BOUNDARY", "polyline": np.array([(*FAR, 0.0), (*FAR, 5.0)])}
+    road = read_one("scenarionet", write(tmp_path, tree)).road
+    assert (road.lanes.points[:, 2] == 20).all()
 
 
 def test_a_track_of_nuscenes_does_not_stop_where_it_ends(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers_processes import apart, forget
 from helpers_skips import by_kind, grown
 from symphony.data.sources import readers
 
@@ -27,7 +26,6 @@ if LINUX:
     from kills import torment
     from kills_targets import files
 
-HERE = Path(__file__).parent
 INPUTS = 8
 NAMES = [*readers(), "test_area", "store", "checkpoint", "submission", "rollouts"]
 
@@ -113,21 +111,3 @@ def test_more_than_are_written_down_are_told() -> None:
     assert (counts, grown(counts, "3 a card\n1 Skipped: lazy\n")) == ({"a card": 3, "Skipped: lazy": 1}, [])
     told = [line.partition(", ")[0] for line in grown(counts, "2 a card\n")]
     assert told == [f"{found} tests skipped for want of {why}" for why, found in counts.items()]
-
-
-def ran(folder: Path, watched: str) -> int:
-    """Run the tests of a folder with its own conftest; the status."""
-    forget("conftest")
-    os.environ["SYMPHONY_SKIPS"] = watched
-    return int(pytest.main(["-q", "-c", os.devnull, str(folder)]))
-
-
-@pytest.mark.parametrize(("watched", "status"), [("", 0), ("1", 1)])
-def test_an_unknown_skip_fails_where_it_is_watched(tmp_path: Path, watched: str, status: int) -> None:
-    (tmp_path / "conftest.py").write_text((HERE / "conftest.py").read_text())
-    (tmp_path / "test_it.py").write_text("import pytest\n\ndef test_it():\n    pytest.skip('lazy')\n")
-    process = apart(ran, tmp_path, watched, said=tmp_path / "said")
-    process.join()
-    said = (tmp_path / "said").read_text()
-    assert process.exitcode == status, said
-    assert "1 Skipped: lazy" in said

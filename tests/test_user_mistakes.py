@@ -171,11 +171,14 @@ def test_a_folder_is_not_gone_on_with_by_another_simulation(store: Path, run: Pa
 @pytest.mark.parametrize(("words", "why"), [
     ("evaluate pretrained:bc_ts_h --branches 8", "--branches has no effect on search 'backtrack'"),
     ("evaluate pretrained:bc_rl --logged-goals", "--logged-goals has no effect: pretrained:bc_rl follows none"),
+    ("evaluate playback --search tree", "--search has no effect on playback"),
+    ("simulate playback --out a --planner idm --trees 2 --rollouts 4", "--trees has no effect on search 'log'"),
+    ("simulate idm --out a --planner-seconds 3", "--planner-seconds has no effect without --planner"),
     ("simulate pretrained:bc_rl --out sim --lights 9 3 2", "are for open traffic beyond the log: see --duration"),
 ])  # fmt: skip
 def test_an_option_without_effect_is_refused(told: Any, store: Path, words: str, why: str) -> None:
     code, printed = told(*words.split(), "--data", store)
-    assert (code, why in printed) == (1, True)
+    assert (code > 0, why in printed) == (True, True)
 
 
 @pytest.mark.parametrize(("words", "message"), [

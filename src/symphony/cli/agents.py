@@ -127,8 +127,8 @@ class Evaluate(shared.SimulationOptions):
 class Table(shared.Command):
     """Build one of the paper's tables from runs that `symphony evaluate` (or a recipe) has evaluated.
 
-    Each method (and each way in which it was simulated) has a row: mean and standard error over its seeds, the best
-    of the BC methods and of the MGAIL methods in bold. Runs of other settings are left out.
+    Each method (and each way in which it was simulated) has a row: mean and standard error over its seeds. Runs of
+    other settings are left out.
     """
 
     #: Setting of the table. `main`: 10 s, 2 interactive agents; `long`: 20 s, 2 agents; `many`: 10 s, 8 agents.

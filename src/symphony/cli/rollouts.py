@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import field
 from pathlib import Path
@@ -43,6 +42,8 @@ class Simulate(shared.SimulationOptions):
 
     def __post_init__(self) -> None:
         evaluation.check_planner_seconds(self.planner_seconds)
+        if self.planner_seconds != Simulate.planner_seconds and not self.planner:
+            raise errors.ConfigError("--planner-seconds has no effect without --planner")
         if self.runs and (self.segments or self.config.rollouts != EvaluateConfig.rollouts):
             raise errors.ConfigError("--runs decides the segments and rollouts: omit --segments, --rollouts")
 
@@ -57,8 +58,8 @@ class Simulate(shared.SimulationOptions):
         store, (planner, drives) = symphony.SegmentStore(self.data).filled(), named_planners(self.planner)
         config: EvaluateConfig = self.config
         config = dataclasses.replace(config, rollouts=config.trees) if self.runs else config
+        shared.check_search(agent, beside_planner(config) if planner and agent.policy is not None else config)
         config = beside_planner(config) if planner else config
-        shared.check_search(agent, config)
         chosen = shared.segment_indices(store, self.segments)
         if self.runs:
             count, config = spread_runs(agent, config, self.runs, len(store), planned=bool(planner))
@@ -186,8 +187,8 @@ class Export(shared.Command):
     """Write saved rollouts in a format of other tools, one file each."""
 
     folder: shared.Saved
-    #: Format: CommonRoad scenarios (XML 2020a), JSON, or OpenSCENARIO (XML 1.2).
-    format: Literal["commonroad", "json", "openscenario"] = "commonroad"
+    #: Format: CommonRoad scenarios (XML 2020a) or OpenSCENARIO (XML 1.2).
+    format: Literal["commonroad", "openscenario"] = "commonroad"
     out: shared.Folder = None  # Folder of the files; by default the folder `export` within SIM.
     segments: shared.Ids = ()
     #: Numbers of the rollouts to export of each run segment, counted from 0; by default all.
@@ -197,12 +198,8 @@ class Export(shared.Command):
         from symphony.saved import export, folder, openscenario
 
         held, count = folder.load_rollouts(self.folder), 0
-        writers: dict[str, tuple[Callable[..., str], str]] = {
-            "commonroad": (export.commonroad, "xml"),
-            "json": (export.as_json, "json"),
-            "openscenario": (openscenario.openscenario, "xosc"),
-        }
-        write, suffix = writers[self.format]
+        road = self.format == "commonroad"
+        write, suffix = (export.commonroad, "xml") if road else (openscenario.openscenario, "xosc")
         with files.Lock((out := self.out or self.folder / "export") / "export.lock"):
             for name in dict.fromkeys(self.segments or held.ids):
                 saved = held.of(name)

@@ -67,6 +67,8 @@ def check_search(agent: symphony.Agent, config: EvaluateConfig) -> None:
     kind = agent.plan(config).kind
     if config.logged_goals and agent.goals is None:
         raise errors.ConfigError(f"--logged-goals has no effect: {agent.name} follows none")
+    if agent.policy is None and config.search not in {"agent", "none"}:
+        raise errors.ConfigError(f"--search has no effect on {agent.name}: there is nothing to search")
     for name in {"tree": (), "backtrack": evaluation.OF_TREES}.get(kind, evaluation.OF_SEARCHES):
         if getattr(config, name) != getattr(EvaluateConfig, name):
             raise errors.ConfigError(f"--{name.replace('_', '-')} has no effect on search '{kind}': see --search")

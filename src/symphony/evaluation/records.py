@@ -53,7 +53,8 @@ def evaluation_record(agent: Agent, result: Evaluation, store: SegmentStore) -> 
     visited, ``policy`` and ``log``, and ``parts``, pseudo-values of the divergence by recording; ``per_segment``, a
     row for each. :func:`symphony.wosac.evaluate.wosac_parts` adds the WOSAC score.
     """
-    policy, log = (counts.tolist() for counts in result.metrics.curvature_histograms())
+    both = [(segment.histogram, segment.histogram_log) for segment in result.metrics.segments.values()]
+    policy, log = (sum(counts[1:], counts[0]).tolist() for counts in zip(*both, strict=True))
     divergence, names = result.metrics.curvature_divergence()
     parts = dict(zip(names, divergence.parts.tolist(), strict=True))
     return {

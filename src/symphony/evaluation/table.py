@@ -185,8 +185,8 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
     beside ours, and nothing that the paper does not have.
 
     As JSON can hold it: ``columns``, the metrics; ``rows`` in the paper's order, each with a cell for each metric
-    (``mean``, ``se`` over seeds, ``values``, and ``best``, whether no method of its family is better), the paper's
-    cells in ``paper``, and ``way`` where its method has a row for each way to simulate; ``notes``. Raises a
+    (``mean``, ``se`` over seeds, ``values``), the paper's cells in ``paper``, and ``way`` where its method has a row
+    for each way to simulate; ``notes``. Raises a
     :class:`ConfigError` for no runs, runs evaluated on different segments or in other traffic, seeds of a method
     evaluated in different ways, or figures that the paper does not have, a :class:`DataError` where an evaluation
     lacks a number that is needed.
@@ -206,7 +206,6 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
         found.setdefault((entry.method, entry.way), []).append(entry)
     methods = [method for method, _ in found]
     paper = {m: {key: {"mean": a, "se": b} for key, (a, b) in cells.items()} for m, cells in figures.items()}
-    _mark_best([{"method": method} | cells for method, cells in paper.items()])
     rows: list[dict[str, Any]] = []
     for (method, way), mine in found.items():
         row: dict[str, Any] = {"method": method, "way": way if methods.count(method) > 1 else ""}
@@ -215,7 +214,6 @@ def compare(entries: Sequence[Entry], setting: Setting, dataset: PaperData | Non
         for key in keys:
             row[key] = _cell([one.number(key) for one in mine] or [first.baseline(method, key)])
         rows.append(row | {"paper": paper.get(method, {})})
-    _mark_best(rows)
     about = {"setting": setting, "paper": dataset, "columns": keys, "rows": rows, "notes": _notes(entries, dataset)}
     return about | dict(zip(("interactive", "duration"), SETTINGS[setting], strict=True))
 
@@ -224,16 +222,6 @@ def _cell(values: Sequence[float]) -> dict[str, Any]:
     """Return the mean of some seeds, NaN where one of them is, and its standard error, NaN for a single seed."""
     error = float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
     return {"mean": float(np.mean(values)), "se": error, "values": list(values)}
-
-
-def _mark_best(rows: Sequence[dict[str, Any]]) -> None:
-    """Mark the lowest of the paper's metrics of the BC and the MGAIL methods; what looks equal is equally good."""
-    for key in METRICS:
-        for row in rows:
-            family = [one for one in rows if one["method"].split("_")[0] == row["method"].split("_")[0]]
-            known = [one[key]["mean"] for one in family if not math.isnan(one[key]["mean"])]
-            shown = [COLUMNS[key].shown(value) for value in (row[key]["mean"], min(known, default=math.nan))]
-            row[key]["best"] = row["method"] not in BASELINES and len(known) > 1 and shown[0] == shown[1]
 
 
 def _wosac_year(entries: Sequence[Entry]) -> str | None:
@@ -275,7 +263,7 @@ def _notes(entries: Sequence[Entry], dataset: PaperData | None) -> list[str]:
     """Return what else must be known to read a table."""
     record = entries[0].record
     where = f"{record['segments']} run segments in {record['data']['name']} ({record['data']['checksum'][:12]})"
-    notes = [where, "± standard error over seeds", "bold: best of the BC methods and of the MGAIL methods"]
+    notes = [where, "± standard error over seeds"]
     notes.append("collisions are counted at states only, as the paper counts them")
     horizons = sorted({round(entry.record["horizon"], 1) for entry in entries if "horizon" in entry.record})
     if any(each != setting_seconds(record) for each in horizons):
@@ -326,8 +314,7 @@ def table_text(table: Mapping[str, Any]) -> str:
         if math.isnan(cell.get("mean", math.nan)):
             return "–"
         error = "" if math.isnan(cell["se"]) else f" ± {column.shown(cell['se'])}"
-        text = column.shown(cell["mean"]) + error
-        return f"**{text}**" if cell.get("best") else text
+        return column.shown(cell["mean"]) + error
 
     paper, grid = table["paper"] is not None, [["method", "seeds"]]
     # Of a metric of a user's own the name in its module.

@@ -104,6 +104,7 @@ _ROW = (
     "standing_log",
 )
 """Numbers that every run segment has for itself."""
+WEIGHTED = ("ade", "min_sade", "offroad_time")  # of these, those of which longer segments weigh more
 
 
 @dataclass(frozen=True)
@@ -216,11 +217,12 @@ class RolloutMetrics:
         """Return a row per segment, ordered by id, for paired comparisons; ``group`` is the recording it is part of.
 
         Percentages (see :meth:`compute`), ``ade`` and ``min_sade`` in metres, and ``goals_variation`` where a search
-        had goals; NaN for a mean over nothing.
+        had goals; NaN for a mean over nothing. ``ade_weight`` and so on: agent-steps, its weight in :meth:`compute`.
         """
         found = []
         for name, segment in sorted(self.segments.items()):
             own: dict[str, Any] = {key: _quotient(*segment.sums[key]) for key in _ROW}
+            own |= {f"{key}_weight": segment.sums[key][1] for key in WEIGHTED}
             choice = {} if segment.choice is None else {"goals_variation": segment.choice.variation}
             about = {"segment": name, "group": segment.group, "ade": segment.ade}
             found.append(about | own | choice)
@@ -233,14 +235,6 @@ class RolloutMetrics:
             return sum(known.values()), math.nan
         member = np.unique([self.segments[name].group for name in known], return_inverse=True)[1]
         return ratio(np.array(list(known.values())), np.ones(len(known)), member)
-
-    def curvature_histograms(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return counts [201] of the branching regions visited by their average curvature: rollouts, and logs."""
-        visited, visited_log = np.zeros((2, BINS), np.int64)
-        for segment in self.segments.values():
-            visited += segment.histogram
-            visited_log += segment.histogram_log
-        return visited, visited_log
 
     def curvature_divergence(self) -> tuple[Divergence, list[str]]:
         """Return the divergence, and the names of its samples: the groups."""

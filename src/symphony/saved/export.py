@@ -1,4 +1,4 @@
-"""Single saved rollouts for other tools: CommonRoad scenarios (XML 2020a) and JSON.
+"""Single saved rollouts for other tools: CommonRoad scenarios (XML 2020a).
 
 Legend: A agents, U states, L lanes, Q lights. Coordinates are those of the source: the segment's, plus its origin.
 """
@@ -6,7 +6,6 @@ Legend: A agents, U states, L lanes, Q lights. Coordinates are those of the sour
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 import xml.etree.ElementTree as ET
 from itertools import count, groupby
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from symphony.data.segment import AgentType, LaneType, RunSegment, SignalState
 from symphony.planners.view import normals
-from symphony.saved.rollouts import PLAYBACK, SavedRollouts, World, world_of
+from symphony.saved.rollouts import SavedRollouts, World, world_of
 
 Reals = NDArray[np.float64]
 
@@ -182,34 +181,3 @@ class _Network:
         _point(node, "position", self.segment.signal_point[light, :2] + self.segment.origin[:2])
         _add(node, "direction", turn)
         _add(node, "active", "true")
-
-
-def as_json(saved: SavedRollouts, rollout: int) -> str:
-    """Return a rollout as JSON: agents with states (step, x, y, heading, speed), routes, events, lights, map."""
-    segment, world, origin = saved.segment, world_of(saved, rollout), saved.segment.origin[:2]
-    place = world.position + origin
-    agents = []
-    for row in np.flatnonzero(world.valid.any(1)).tolist():
-        values = np.column_stack([place[row], world.heading[row], world.speed[row]])
-        steps = np.flatnonzero(world.valid[row]).tolist()
-        length, width = segment.size[row, :2].tolist()
-        agent: dict[str, Any] = {"id": int(segment.agent_id[row]), "driver": PLAYBACK, "length": length}
-        agent |= {"type": AgentType(segment.agent_type[row]).name.lower(), "width": width, "ego": row == segment.ego}
-        agent["states"] = [[step, *(round(value, 6) for value in values[step].tolist())] for step in steps]
-        for n in np.flatnonzero(saved.agents == row).tolist():
-            agent["driver"], route = saved.drivers[n], int(saved.goal[rollout, n])
-            agent["route"] = None if route < 0 else (saved.routes[route][:, :2] + origin).tolist()
-            for name in ("collision", "offroad"):
-                flags = getattr(saved, name)[rollout, :, n] & saved.counted[rollout, :, n]
-                agent[name] = (1 + np.flatnonzero(flags)).tolist()
-        agents.append(agent)
-    road = {name: getattr(segment.road, name) for name in ("lanes", "boundary", "marks")}
-    plain = {name: [(x[k][:, :2] + origin).tolist() for k in range(len(x))] for name, x in road.items()}
-    lights = []
-    for light, lane in enumerate(segment.signal_lane.tolist()):
-        shown = segment.signal_state[light, saved.start : saved.last + 1].tolist()
-        stop = (segment.signal_point[light, :2] + origin).tolist()
-        lights.append({"lane": lane, "stop": stop, "states": [SignalState(state).name.lower() for state in shown]})
-    found: dict[str, Any] = {"segment": segment.segment_id, "rollout": rollout, "dt": float(segment.dt)}
-    found |= {"steps": saved.steps, "failed": saved.failed.get(rollout), "agents": agents, "lights": lights}
-    return json.dumps(found | {"map": plain}, allow_nan=False) + "\n"

@@ -280,6 +280,8 @@ def evaluate_wosac(
     """
     if config not in CHALLENGES:
         raise ConfigError(f"config must be one of {', '.join(CHALLENGES)}, is {config}")
+    if len(set(items)) < len(items):
+        raise ConfigError("items name a run segment twice")
     if not items:
         raise DataError("the store holds no run segments", file=store.path)
     how = simulated_how(agent, settings) if agent.policy is not None else {"search": "log"}

@@ -35,7 +35,7 @@ _WORDS = {
 def wosac_table(record: dict[str, Any]) -> str:
     """Return a table in Markdown: the baselines of a record that has them, its agent, and what the table is of."""
     name, found = record["agent"], record["agents"]
-    rows = [(_WORDS[other], numbers) for other, numbers in found.items() if other in _WORDS and len(found) > 1]
+    rows = [(_WORDS[other], numbers) for other, numbers in found.items() if other in _WORDS and other != name]
     rows.append((f"{name}, {how_in_words(record['how'])}", found[name]))
     lines = [["", *(column.title for column in COLUMNS), "order kept %"], ["---"] * (len(COLUMNS) + 2)]
     for row, numbers in rows:
@@ -47,13 +47,14 @@ def wosac_table(record: dict[str, Any]) -> str:
 
 
 def how_in_words(how: dict[str, Any]) -> str:
-    """Return how rollouts were made, such as ``32 trees of 4, systematic every 2, sampled goals``."""
+    """Return how rollouts were made, such as ``32 trees of 4, systematic every 2, sampled goals, pace 0.25``."""
     way = {
         "tree": "32 trees of {branches}, {rule} every {prune_every}",
         "backtrack": "back where bad, every {prune_every}",
     }.get(how["search"], "no search")
     goals = {True: ", logged goals", False: ", sampled goals", None: ""}[how.get("logged_goals")]
-    return way.format(**how) + (f", by {how['score']}" if "score" in how else "") + goals
+    pace = f", pace {how['pace']:g}" if "pace" in how else ""
+    return way.format(**how) + (f", by {how['score']}" if "score" in how else "") + goals + pace
 
 
 def _note(record: dict[str, Any]) -> str:

@@ -6,7 +6,8 @@
   is the span of the timestamps divided by their number less one. ``current_step`` is the last observed step.
 - The ego is the recording vehicle, track ``AV``, which gets the id :data:`EGO_ID`. Agents are in order of id. The
   focal track is the agent of interest; focal and scored tracks are for prediction, in that order.
-- The format has **no box sizes** (see :data:`NOMINAL_SIZES`) and no heights. Coordinates are relative to the ego's
+- The format has **no box sizes** (see :data:`NOMINAL_SIZES`) and no heights. Of the ego it has the rear axle (see
+  :func:`.base.from_rear_axle`). Coordinates are relative to the ego's
   first position, rounded to metres.
 - A lane's line is the file's ``centerline`` or, where it has none, the middle of its bounds. Neighbours are those of
   the same direction only. Maps are cropped: references to lanes beyond are left out, and the edge of the crop is no
@@ -199,7 +200,8 @@ def _segment(columns: Columns, name: str, path: Path) -> RunSegment:
     refuse(not len(focal), "names no track of the file", "focal_track_id")
     state, valid = np.zeros((len(names), steps, len(_STATE))), np.zeros((len(names), steps), np.bool_)
     state[row, step], valid[row, step] = np.stack([columns[name] for name in _STATE], axis=-1), True
-    origin = np.round(state[0, np.argmax(valid[0]), :2])
+    dt, origin = _time_step(columns), np.round(state[0, np.argmax(valid[0]), :2])
+    state[0] = base.from_rear_axle(state[0], range(len(_STATE)), valid[0], dt)
     kinds = columns["object_type"][first][order].tolist()
     types, sizes = zip(*(NOMINAL_SIZES.get(kind, NOMINAL_SIZES["unknown"]) for kind in kinds), strict=True)
     unknown = [f"{kind[:40]!r}" for kind in kinds if kind not in NOMINAL_SIZES]
@@ -209,7 +211,7 @@ def _segment(columns: Columns, name: str, path: Path) -> RunSegment:
     return RunSegment(
         segment_id=name,
         source=Argoverse2Reader.name,
-        dt=_time_step(columns),
+        dt=dt,
         ego=0,
         agent_id=ids[order],
         agent_type=np.array(types, np.uint8),

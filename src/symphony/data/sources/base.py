@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import xml.etree.ElementTree as ET
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 from xml.parsers import expat
@@ -24,6 +24,7 @@ Odd = dict[str, str]  # what was left out, or is unusual: kind -> example
 Item = RunSegment | DataError  # one record of a file: a valid run segment, or why there is none
 MAX_NUMBER = 1e8  # larger magnitudes are no metres, seconds or radians of a road
 NEAR = 50.0  # metres within which another agent counts as a neighbour of an ego candidate
+FROM_AXLE = 1.4  # metres from the rear axle to the middle of the box, of the cars that recorded these logs
 MOVING = 2.0  # metres an agent must get away from where it is first seen to count as moving
 
 MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
@@ -207,6 +208,22 @@ def motion(position: Doubles, heading: Doubles, velocity: Doubles, valid: Bools)
         "velocity": to_float32(np.where(valid[..., None], velocity, 0.0)),
         "valid": valid,
     }
+
+
+def from_rear_axle(states: Doubles, columns: Sequence[int], valid: Bools, dt: float) -> Doubles:
+    """Return the states [T, D] of a recording car whose rear axle was logged, brought to the middle of its box.
+
+    The columns are those of x, y, heading, and the velocity's x and y. The middle lies :data:`FROM_AXLE` ahead of the
+    axle, and its velocity gains what turning adds.
+    """
+    x, y, heading, *velocity = columns
+    moved, steps = states.copy(), np.flatnonzero(valid & np.isfinite(states).all(axis=-1))
+    angle = np.unwrap(states[steps, heading])
+    turn = np.gradient(angle, steps * dt) if len(steps) > 1 else np.zeros(len(steps))
+    ahead = FROM_AXLE * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    moved[steps[:, None], [x, y]] += ahead
+    moved[steps[:, None], velocity] += turn[:, None] * ahead[:, ::-1] * (-1, 1)
+    return moved
 
 
 def pairs(links: list[tuple[int, int]]) -> NDArray[np.int32]:

@@ -4,8 +4,8 @@
   on its left. One that is open in both directions counts in the one it is drawn in.
 - A node lies where its file says in metres (attributes ``x``, ``y`` as in INTERACTION's ``.osm_xy`` files, else tags
   ``local_x``, ``local_y``), if that holds for every node; else its latitude and longitude are projected.
-- Lanes are the lanelets for vehicles or bicycles; footways, stairs and rails are left out, crosswalks are marks, as
-  are painted lines and stop signs.
+- Lanes are the lanelets for vehicles or bicycles, by their ``participant:`` tags or else their subtype; footways,
+  stairs and rails are left out, crosswalks are marks, as are painted lines and stop signs.
 - A lane's successors begin with the two nodes its bounds end with. Its neighbour shares the whole bound between them,
   in the same direction, unless the bound may not be crossed there (a solid line, a kerb, the tag ``lane_change``).
 - The boundary encloses these lanelets and the areas for vehicles (``multipolygon``: parking lots, exits, free space),
@@ -42,11 +42,13 @@ MPH, KMH = 0.44704, 1 / 3.6
 _DRIVABLE = ["road", "highway", "play_street", "bus_lane", "emergency_lane", "exit", "parking", "freespace"]
 """Subtypes of areas on which vehicles may be."""
 _NO_LANES = frozenset({"walkway", "shared_walkway", "crosswalk", "stairs", "rail"})
-_TYPES = dict.fromkeys(("bicycle_lane", "bikelane"), LaneType.BIKE_LANE) | {"highway": LaneType.FREEWAY}
+_BIKE_LANES = frozenset({"bicycle_lane", "bikelane"})
 _EDGES = frozenset({"road_border", "curbstone", "fence", "wall", "guard_rail", "jersey_barrier"})
 _PAINT = frozenset({"line_thin", "line_thick", "stop_line"})
 _STOP_SIGNS = re.compile(r"(de206|r1-1(?!\d)|\bstop\b)", re.IGNORECASE)
-_SPEED = re.compile(r"(\d+(?:\.\d+)?)\s*(mph|km/h|kmh|m/s|mps)?\s*$", re.IGNORECASE)
+_SPEED = re.compile(r"(?:[a-z][\w.-]*[-_](?=[5-9]|\d\d))?(\d+(?:\.\d+)?)\s*(mph|km/h|kmh|m/s|mps)?", re.IGNORECASE)
+_SIGNS = {"de274.1": "30", "de274_1": "30", "de310": "50"}
+"""Signs whose code does not say the limit they mean, in km/h: those of zones and of towns."""
 
 MAX_LATITUDE = 84.0  # degrees up to which UTM is defined
 SEMI_MAJOR, FLATTENING = 6_378_137.0, 1 / 298.257223563  # of the WGS 84 ellipsoid, metres
@@ -81,6 +83,14 @@ class Lanelet:
     def subtype(self) -> str:
         """The subtype; ``road`` where the map does not name it."""
         return self.tags.get("subtype", "road")
+
+    @property
+    def lane_type(self) -> LaneType | None:
+        """Which lane it is; None for footways, stairs and rails."""
+        if _admits(self.tags, "vehicle", self.subtype not in _NO_LANES | _BIKE_LANES):
+            return LaneType.FREEWAY if self.subtype == "highway" else LaneType.SURFACE_STREET
+        bicycles = self.subtype != "crosswalk" and _admits(self.tags, "bicycle", self.subtype in _BIKE_LANES)
+        return LaneType.BIKE_LANE if bicycles else None
 
     @property
     def ring(self) -> Doubles:
@@ -231,15 +241,21 @@ def _aligned(left: Way, right: Way) -> tuple[Way, Way, tuple[bool, bool]]:
 
 def _area(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> shapely.Polygon | None:
     """Return a place for vehicles without a direction (a parking lot) by its participants or subtype, or None."""
-    named = {name: value for name, value in tags.items() if name.startswith("participant:")}
-    allowed = any(n.startswith("participant:vehicle") and value == "yes" for n, value in named.items())
-    if not (allowed if named else tags.get("subtype") in _DRIVABLE):
+    if not _admits(tags, "vehicle", tags.get("subtype") in _DRIVABLE):
         return None
     field = f"area {base.integer(node.get('id'), 'relation id')}"
     members = _members(node, "way", field)
     outer, inner = (_closed(members.get(role, []), ways, f"{field}: {role}") for role in ("outer", "inner"))
     refuse(len(outer) != 1, f"{len(outer)} outlines, expected one", f"{field}: outer")
     return shapely.Polygon(outer[0].exterior, [hole.exterior for hole in inner])
+
+
+def _admits(tags: Tags, who: str, by_subtype: bool) -> bool:
+    """Return who may be there: as soon as a tag admits one participant, the subtype counts no more."""
+    told = {name: value == "yes" for name, value in tags.items() if name.startswith("participant:")}
+    if any(told.values()):
+        return any(yes and name.startswith(f"participant:{who}") for name, yes in told.items())
+    return by_subtype and told.get(f"participant:{who}", True)
 
 
 def _closed(refs: list[int], ways: dict[int, Way], field: str) -> list[shapely.Polygon]:
@@ -251,14 +267,18 @@ def _closed(refs: list[int], ways: dict[int, Way], field: str) -> list[shapely.P
 
 def _rule(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> tuple[int, tuple[Tags, list[Way]]]:
     rule_id = base.integer(node.get("id"), "relation id")
-    refs = _members(node, "way", f"regulatory element {rule_id}").get("ref_line", [])
+    members = _members(node, "way", f"regulatory element {rule_id}")
     # Lines outside the map's section are missing in it.
-    return rule_id, (tags, [ways[ref] for ref in refs if ref in ways and len(ways[ref].line)])
+    found = {
+        role: [ways[ref] for ref in refs if ref in ways and len(ways[ref].line)] for role, refs in members.items()
+    }
+    signs = [sign.tags.get("subtype", "") for sign in found.get("refers", ())]
+    return rule_id, ({"sign_type": "".join(signs[:1])} | tags, found.get("ref_line", []))
 
 
 def lane_lanelets(source: LaneletMap) -> list[Lanelet]:
     """Return the lanelets that are lanes, at least one; lane k of :func:`road_map` is number k."""
-    lanes = [lanelet for lanelet in source.lanelets if lanelet.subtype not in _NO_LANES]
+    lanes = [lanelet for lanelet in source.lanelets if lanelet.lane_type is not None]
     refuse(not lanes, "has no lanes", "lanelet")
     refuse(len({lane.lanelet_id for lane in lanes}) < len(lanes), "two lanelets of one id", "lanelet")
     return lanes
@@ -277,7 +297,7 @@ def road_map(source: LaneletMap, origin: Doubles) -> RoadMap:
         Lane(
             way.lanelet_id,
             way.center,
-            _TYPES.get(way.subtype, LaneType.SURFACE_STREET),
+            way.lane_type or LaneType.SURFACE_STREET,
             lines.median_width(*way.bounds),
             _speed_limit(way, source.rules),
         )
@@ -314,14 +334,15 @@ def _beside(lanes: Sequence[Lanelet], left: bool) -> Links:
 
 def _may_cross(bound: Way, turned: bool, to_left: bool) -> bool:
     """Return whether the line between two lanes may be crossed; of unknown and unmarked ones it is assumed."""
-    explicit = bound.tags.get("lane_change")
+    side = "left" if to_left != turned else "right"
+    explicit = bound.tags.get(f"lane_change:{side}", bound.tags.get("lane_change"))
     if explicit in {"yes", "no"}:
         return explicit == "yes"
     if bound.tags.get("type") in _EDGES:
         return False
     # The names give the left line first, seen along the way as it is drawn: the near one counts.
     first, _, second = bound.tags.get("subtype", "").partition("_")
-    near = (second or first) if to_left != turned else first
+    near = (second or first) if side == "left" else first
     return near != "solid"
 
 
@@ -336,7 +357,7 @@ def _speed_limit(lane: Lanelet, rules: Rules) -> float:
 
 def _speed(text: str) -> float:
     """Return m/s of ``50``, ``50 km/h``, ``25 mph``, ``de274-50``, ``us_r2-1-25``; without a unit km/h; else 0."""
-    found = _SPEED.search(text)
+    found = _SPEED.fullmatch(_SIGNS.get(text.lower(), text))
     if found is None:
         return 0.0
     unit = (found[2] or ("mph" if text.lower().startswith("us") else "km/h")).lower()

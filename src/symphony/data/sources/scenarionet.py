@@ -6,9 +6,10 @@ Pickles can do anything; these are read by :mod:`.safe_pickle`, which admits pla
   the id. The ego is the recording vehicle (``sdc_id``). Agents are in file order; their ids are the track's names if
   all are numbers, else their place in the file.
 - A box size is the median over the valid states. An ego wider than long (ScenarioNet swaps the two for nuScenes) is
-  turned. The position of nuScenes' ego is that of its rear axle, as logged. Velocities of nuScenes are differences to
+  turned. NuScenes logs the ego's rear axle (see :func:`.base.from_rear_axle`). Its velocities are differences to
   the next position; at the last state of a track, where ScenarioNet writes 0, that of the state before is taken.
-- Coordinates are relative to the ego's first position, rounded to metres, z as logged; maps of nuScenes have none.
+- Coordinates are relative to the ego's first position, rounded to metres, z as logged; maps without road edges get
+  none (nuScenes has none, and Argoverse 2 none for its agents).
 - Successors and neighbours are the source's, or derived from the geometry where it has none (nuScenes) or names all
   lanes of a road (MetaDrive; neighbours of nuPlan): see :func:`_successors`, :func:`_neighbors`. The boundary is the
   road edges, or goes round the union of the drivable areas (``boundary_…``, if all are closed) and the lanes' areas,
@@ -20,6 +21,7 @@ Pickles can do anything; these are read by :mod:`.safe_pickle`, which admits pla
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +53,7 @@ _LIGHTS |= dict.fromkeys(("TRAFFIC_LIGHT_UNKNOWN", "None"), SignalState.UNKNOWN)
 _LANES = {f"LANE_{kind.name}": kind for kind in LaneType}
 _LANES |= {"LANE_UNKNOWN": LaneType.UNDEFINED, "LANE_SURFACE_UNSTRUCTURE": LaneType.SURFACE_STREET}
 _AREAS = {kind.name: kind for kind in (MarkType.CROSSWALK, MarkType.SPEED_BUMP, MarkType.DRIVEWAY)}
-_NO_LIMITS = frozenset({"nuscenes", "av2"})
+_REAR_AXLE = _NO_LIMITS = frozenset({"nuscenes", "av2"})
 """Datasets without speed limits: ScenarioNet writes 100 km/h for connectors, and 85 mph for all lanes."""
 
 
@@ -92,6 +94,8 @@ def _segment(scenario: Mapping[Any, Any], name: str, file: str) -> RunSegment:
         # The last of consecutive valid states gets the velocity of the one before.
         last = valid[:, 1:] & valid[:, :-1] & ~np.pad(valid[:, 2:], ((0, 0), (0, 1)))
         states[:, 1:, 4:6][last] = states[:, :-1, 4:6][last]
+    if dataset in _REAR_AXLE:
+        states[row] = base.from_rear_axle(states[row], (0, 1, 3, 4, 5), valid[row], dt)
     interest, predict = (np.array([names.index(k) for k in each if k in names], np.int32) for each in marked)
     numeric = all(each.isdecimal() and len(each) < 18 for each in names)
     segment = RunSegment(
@@ -221,7 +225,9 @@ def _map(scenario: Mapping[Any, Any], dataset: str, origin: Doubles) -> tuple[Ro
     links = [(a, b) for a, b in lines.named(lanes, "successors") if a != b] if told else _successors(lanes)
     beside = None if any(lane.left or lane.right for lane in lanes) else _neighbors(lanes, areas)
     flow = base.pairs(links)
-    edges = edges or lines.opened(_rings(lanes, areas, outlines), _cuts(lanes, flow))
+    if not edges:  # the boundary made here has no heights: lanes that kept theirs would be other levels
+        lanes = [replace(lane, line=lane.line[:, :2]) for lane in lanes]
+        edges = lines.opened(_rings(lanes, areas, outlines), _cuts(lanes, flow))
     numbers = range(len(lanes))
     return lines.road_map(lanes, origin, edges, marks, links=flow, beside=beside, ids=numbers), lanes
 

@@ -293,7 +293,7 @@ const KEYS = { " ": () => play(!view.playing), ArrowRight: () => stepBy(1), Arro
 document.addEventListener("keydown", event => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT" || !scene) return;
   if (event.key === "Tab" && event.target === shown.canvas) { event.preventDefault(); tab(event.shiftKey ? -1 : 1); return; }
-  if (event.target.tagName === "BUTTON" && event.key === " ") return;
+  if ((event.target.tagName === "BUTTON" || event.target.type === "checkbox") && event.key === " ") return;
   if (event.target.type === "range" && event.key.startsWith("Arrow")) event.preventDefault();
   const action = KEYS[event.key];
   if (action) { action(); event.preventDefault(); }
