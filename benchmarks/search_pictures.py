@@ -59,7 +59,7 @@ def simulated(agent: Agent, segment: RunSegment, seed: int, *, back: bool) -> tu
     rule: Backtrack | ReplaceBad = ReplaceBad(0.0)
     if back:
         plain = going_back(
-            env, 0.0, BRANCHES, lambda state: with_drawn_goals(env, agent.goals, state, seed, "branch")
+            env, 0.0, start, lambda state, _: with_drawn_goals(env, agent.goals, state, seed, "branch")
         )
 
         def renew(state: TensorDictBase, attempt: Int[Tensor, " R"]) -> TensorDictBase:

@@ -193,7 +193,11 @@ def test_the_merged_store_holds_every_segment_as_it_was(tmp_path: Path) -> None:
             assert merged.tags(offset + k) == store.tags(k)
         offset += len(store)
     assert merged.groups.tolist() == [name for store in stores for name in store.groups.tolist()]
-    both = merge(PARTS[1:], tmp_path / "both", mirror=True)
+    shutil.copytree(PARTS[1], part := tmp_path / "part")
+    counted = {"overlaps": 3, "joined_gaps": 2, "odd": {"a kind": 1}}
+    (part / "report.json").write_text(json.dumps(Report(**counted).to_json()))
+    both = merge([part], tmp_path / "both", mirror=True)
+    assert [both.report[name] for name in counted] == [6, 4, {"a kind": 2}]
     assert len(both) == both.report["converted"] == 2 * len(stores[1])
     assert (both.tags(-1), both.ids[-1]) == (stores[1].tags(-1), f"{stores[1].ids[-1]}-mirrored")
     assert set(both.groups) == set(stores[1].groups)  # of the same recordings

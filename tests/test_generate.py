@@ -518,11 +518,16 @@ def test_streets_of_openstreetmap_are_driven_and_footways_are_not(tmp_path: Path
     where = {k: f'lat="{48 + 0.0009 * x:.6f}" lon="{9 + 0.00134 * y:.6f}"' for k, (x, y) in places.items()}
     nodes = [f'<node id="{k}" {place}/>' for k, place in where.items()]
     west, south = ("".join(f'<nd ref="{k}"/>' for k in way) for way in ((1, 2, 3), (4, 2, 5)))
-    file = tmp_path / "streets.osm"
+    (file := tmp_path / "streets.osm").write_text("nothing yet")
+    with pytest.raises(DataError, match=r"streets\.osm"):
+        generate(Plan(1, kinds=(str(file),)), tmp_path / "store")
     file.write_text(OSM.format(nodes="\n".join(nodes), west=west, south=south))
     network = read_network(own_network(file, tmp_path))
     assert (len(network.centers), len(network.sources())) == (1, 4)
     assert driven_length(tmp_path / "net.net.xml") == pytest.approx(4 * 600, rel=0.1)
+    assert generate(Plan(1, kinds=(str(file),)), tmp_path / "store").complete  # the mended file
+    file.write_text(re.sub('<way id="2".*', "", file.read_text()))
+    assert len(read_network(own_network(file, tmp_path)).lanes) == 2  # a road that meets no other
 
 
 @needs_sumo

@@ -206,6 +206,12 @@ def test_the_discriminator_is_shown_what_was_simulated_and_what_was_logged(store
     assert torch.equal(real[keys.GOAL], env.scenes.route_logged[at[0]])
     seen = torch.zeros_like(fit.valid[..., 0]).index_put(at, torch.tensor(True))
     assert torch.equal(seen[:, 1:], fit.valid[:, 1:].any(-1))
+    fit.state[0, 4:, 0, 0] += 2.1  # where a fit leaves the log it is not shown
+    replay._fitted = fit
+    real = replay.both_kinds(torch.Generator().manual_seed(0))[200:]
+    far = (torch.arange(len(fit.valid[0])) > 3) & fit.valid[0, :, 0]
+    left = (fit.valid[0].any(-1) & ~far).nonzero().flatten().tolist()
+    assert {0, *real[keys.STEP][real[keys.SCENE] == 0].tolist()} == {0, *left}
 
 
 @pytest.mark.parametrize("method", ["bc_rl", "bc_rl_h"])

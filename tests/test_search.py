@@ -383,19 +383,20 @@ def test_compiled_runs_are_the_runs_by_one_program_for_batches_of_few_shapes(sto
     assert {name: theirs[name] for name in ours} == pytest.approx(ours, rel=1e-4, abs=1e-5, nan_ok=True)
 
 
-def test_the_batch_changes_nothing_in_lines(store, monkeypatch):
+@pytest.mark.parametrize("threshold", [LINES.threshold, -1.0])  # at the latter all go back as often as they may
+def test_the_batch_changes_nothing_in_lines(store, threshold, monkeypatch):
     module = sys.modules["symphony.rollouts.search"]
     monkeypatch.setattr(module, "Backtrack", partial(Backtrack, cap=1.0))
-    config = replace(LINES, rollouts=3, interactive="all")
+    config = replace(LINES, rollouts=3, interactive="all", threshold=threshold)
     whole = crowds(store, [1, 2, 3], config)
     assert whole.steps > 1.1 * 3 * 3 * (whole.rollouts.state.shape[2] - 1)
     monkeypatch.setattr(module, "FEW", 3)
-    part = crowds(store, [3, 1], config)  # and fewer at a time than there are
+    part = crowds(store, [3, 2], config)  # shorter ones, and fewer at a time than there are
     agents, steps = part.rollouts.state.shape[3], part.rollouts.counted.shape[2]
     for name in Rollouts._fields:
-        value = getattr(whole.rollouts, name)[[2, 0], :, : steps + (name == "state"), :agents]
+        value = getattr(whole.rollouts, name)[[2, 1], :, : steps + (name == "state"), :agents]
         assert torch.equal(value, getattr(part.rollouts, name))
-    assert torch.equal(whole.goal[[2, 0], :, :agents], part.goal)
+    assert torch.equal(whole.goal[[2, 1], :, :agents], part.goal)
 
 
 def test_lines_avoid_what_they_are_judged_by(store, monkeypatch):

@@ -43,6 +43,7 @@ class Backtrack:
             everything is kept and numbers come from a global generator.
         width: lines simulated at a time; a waiting line begins whenever one ends, so that few steps have few lines.
             None for all at once. It changes memory and speed only.
+        lengths: steps of each line [M], where some end before the others; None if all are equally long.
     """
 
     threshold: float
@@ -50,6 +51,7 @@ class Backtrack:
     cap: float = 6.0
     renew: Renew | None = None
     width: int | None = None
+    lengths: Int[Tensor, " M"] | None = None
 
     def __post_init__(self) -> None:
         back = bool(self.back) and min(self.back) >= 0 and self.back[0] >= 1
@@ -63,8 +65,8 @@ class Course:
     longer count against it, and `blame` those that were bad at all its tries so far and may be excused next.
     """
 
-    def __init__(self, rule: Backtrack, lines: int, agents: int, periods: int, device: torch.device) -> None:
-        self.rule, self.periods = rule, periods
+    def __init__(self, rule: Backtrack, most: Int[Tensor, " M"], agents: int) -> None:
+        self.rule, self.most, lines, device = rule, rule.cap * most, len(most), most.device
         self.back = torch.tensor(rule.back, device=device)
         # Tries since it passed its last bad period, the place of that, and periods simulated again.
         self.at, self.times, self.tries, self.front, self.again = torch.zeros(
@@ -82,7 +84,7 @@ class Course:
         # Those who were bad at every try; the others are in trouble for the first time.
         excused = torch.where(blame.any(-1, keepdim=True), blame, worst) & failed[:, None]
         rest, tries = worst & ~excused, torch.where(failed, 0, tries)
-        goes = bad & rest.any(-1) & (self.again[line] < self.rule.cap * self.periods)
+        goes = bad & rest.any(-1) & (self.again[line] < self.most[line])
         back = self.back[tries.clamp_max(len(self.back) - 1)]
         to = torch.where(back == 0, 0, (at + 1 - back).clamp_min(0))
         past = ~bad & (at >= front + self.rule.back[0])
@@ -130,15 +132,16 @@ def follow(
     lines, device = start.numel(), ended.device
     periods, short = -(-steps // every), steps % every
     entries, length = list(start.keys(True, True)), periods * every
-    waiting = torch.arange(lines, device=device)
-    line, waiting = waiting[: rule.width], waiting[rule.width or lines :]
+    order = torch.arange(lines, device=device)
+    line, waiting = order[: rule.width], order[rule.width or lines :]
     now, over = take(start, line[:, None]), take_values(ended, line[:, None], start.ndim)
     simulated = line.new_zeros(())
     history: TensorDictBase | None = None
     while len(line):
         run = simulate(now, over, every)
         if history is None:
-            course = Course(rule, lines, run.scores.shape[-1], periods, device)
+            own = torch.full_like(order, steps) if rule.lengths is None else rule.lengths
+            course = Course(rule, -(-own // every), run.scores.shape[-1])
         at, excused = course.at[line], course.excused[line]
         ending = (at == periods - 1) & (short > 0)
         judged = run._replace(scores=run.scores.masked_fill(excused[:, None, None], 0.0))

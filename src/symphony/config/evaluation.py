@@ -74,7 +74,7 @@ class SimulationConfig(Settings):
     #: and with `agent` they do as in the agent's training.
     goals: Goals = "agent"
     #: Share of the variance of an agent's random numbers that is drawn once per rollout, so that some agents are fast
-    #: throughout and others slow; 0: every step draws anew.
+    #: throughout and others slow; 0: every step draws anew. Branches that are copied or go back draw it again.
     pace: Annotated[float, Bounds(0, 1)] = 0.0
     seed: int = 0  # Seed of everything that is drawn at random in the rollouts.
     device: str = "cpu"  # Device that simulates: `cpu`, `cuda` or `cuda:N`.

@@ -468,6 +468,8 @@ def merge(paths: Sequence[Path], out: Path, progress: Told = lambda *_: None, mi
                 way(store, index)
                 progress(len(writer), total)
     report = replace(report, converted=total, settings={"merged": [s.path.name for s in stores], "mirrored": mirror})
+    tagged = {name: getattr(report, name) * (1 + mirror) for name in ("overlaps", "joined_gaps")}
+    report = replace(report, **tagged, odd={kind: number * (1 + mirror) for kind, number in report.odd.items()})
     writer.write_report(report.to_json())
     draft.rename(out)
     return SegmentStore(out)

@@ -258,7 +258,7 @@ def generate(
 def _begun(store: SegmentStore, settings: Mapping[str, Any]) -> Generation:
     """Return where to continue, after checking that the store is of the same plan."""
     report = store.report
-    if not report and not len(store):
+    if not len(store) and (not report or (report.get("generation") or {}).get("networks") == 0):
         return Generation()
     there = report.get("settings") or {}
     if "generation" not in report or there.get("reader") != "generate":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections import OrderedDict
@@ -296,10 +297,12 @@ class SceneDataset:
         return expert_batch(self._placed(tuple(items), device), *where, observation, action=action, routes=routes)
 
     def goal_updates(self, most: int, processes: int = 1) -> int:
-        """Return after how many updates the goal policy has learned from each agent ``PASSES`` times, at most
-        ``most``. Soon after that, it would know the choices of few agents by heart, as each chooses just one route.
+        """Return after how many updates the goal policy has learned from each expert ``PASSES`` times, at most
+        ``most``. Soon after, it would know few choices by heart. Some segments tell how many agents are experts.
         """
-        return min(most, -(-PASSES * int(self.store.num_agents[self.indices].sum()) // (GOALS * processes)))
+        agents, some = self.store.num_agents[self.indices], evenly_spaced(len(self.indices), 32)
+        share = sum(len(expert.agent) for expert in self.experts.many(some)) / max(int(agents[some].sum()), 1)
+        return min(most, max(math.ceil(PASSES * share * int(agents.sum()) / (GOALS * processes)), 1))
 
     def sample_goals(
         self,

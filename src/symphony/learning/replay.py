@@ -19,18 +19,11 @@ from symphony.envs.driving import DrivingEnv
 from symphony.envs.observation import ObservationConfig
 from symphony.errors import ConfigError
 from symphony.learning.demonstrations import Fitted, SceneDataset
+from symphony.learning.experts import FOLLOWS, logged
 from symphony.objectives import auc
 
-_LEARNED = (
-    *keys.SEEN,
-    keys.OBJECTS_MASK,
-    keys.POINTS_MASK,
-    keys.LIGHTS_MASK,
-    keys.VALID,
-    keys.ACTION,
-    keys.ROLLOUT,
-    keys.WEIGHT,
-)
+_MASKS = (keys.OBJECTS_MASK, keys.POINTS_MASK, keys.LIGHTS_MASK, keys.VALID)
+_LEARNED = (*keys.SEEN, *_MASKS, keys.STATE, keys.ACTION, keys.ROLLOUT, keys.WEIGHT)
 COLLIDED, OFF_ROAD, MEMORY = 1.0, 0.5, 2.0
 """Costs of a collision and of a second off the road; seconds over which an action is to blame for it (1 / e)."""
 PRICE = 60.0
@@ -148,12 +141,14 @@ class SearchReplay:
     def _logged(self, count: int, rng: torch.Generator) -> TensorDict:
         scenes = self._scenes
         self._fitted = self._fitted or self.data.fitted(scenes.segment.tolist(), scenes)
-        state, logged, progress, *_ = self._fitted
-        rows = logged[:, 1:].any(-1).nonzero()
+        state, there, progress, *_ = self._fitted
+        # Where the fit of an agent leaves the log, it would teach what nobody does.
+        away = (state[..., :2] - logged(scenes)[0][..., :2]).norm(dim=-1) > FOLLOWS
+        rows = (there.any(-1) & ~(there & away).any(-1))[:, 1:].nonzero()
         pick = self.data.pick(len(rows), count, scenes.segment.tolist(), rng)
         scene, step = rows[pick.to(rows.device)].unbind(-1)
         step = step + 1
-        valid = logged[scene, step]
+        valid = there[scene, step]
         # Agents that see no routes follow none.
         route = scenes.route_logged if self.env.observation.route else torch.full_like(scenes.interactive, -1)
         return TensorDict(

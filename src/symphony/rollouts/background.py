@@ -180,9 +180,8 @@ def _limits(scenes: SceneBatch, points: Tensor, unknown: float) -> Float[Tensor,
     for b in range(len(scenes)):
         lanes, speed = scenes.point[b, lane[b]], scenes.point_speed[b, lane[b]]
         if len(lanes):
-            # By squares of differences: torch's quicker way cancels far from the origin.
             away = torch.cdist(points[b].flatten(0, 1), lanes, compute_mode="donot_use_mm_for_euclid_dist")
-            limit = speed[away.argmin(-1)].reshape(points.shape[1:3])
+            limit = speed[away.argmin(-1)].reshape(points.shape[1:3])  # the quicker cdist cancels far from the origin
             found[b] = torch.where(limit > 0, limit, unknown)
     return found
 

@@ -218,7 +218,7 @@ def _searched(
     """Simulate by a search, or by one that prunes nothing, for a step that is compiled."""
     rule: PruningRule | Backtrack = KeepAll() if plan.kind == "none" else pruning_rule(plan.search)
     if plan.kind == "backtrack":
-        rule = going_back(env, plan.search.threshold, start.numel(), goals.renewed)
+        rule = going_back(env, plan.search.threshold, start, goals.renewed)
     about: dict[str, Any] = {"prune_every": plan.search.prune_every, "score": plan.search.score, "leaves": plan.taken}
     with torch.no_grad():
         result = search(env, actor, scorer, start, seed=config.seed, pace=config.pace, rule=rule, **about, **how)

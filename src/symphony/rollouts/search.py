@@ -23,6 +23,7 @@ from symphony.collectors import (
     beam_search,
     max_then_sum,
 )
+from symphony.collectors.backtracking import Renew
 from symphony.collectors.rules import takes_groups
 from symphony.config import Score, SearchConfig
 from symphony.envs.driving import DrivingEnv
@@ -214,12 +215,10 @@ def search(
         raise ConfigError(str(error)) from error
 
 
-def going_back(
-    env: DrivingEnv, threshold: float, lines: int, begin: Callable[[TensorDictBase, Tensor], TensorDictBase]
-) -> Backtrack:
-    """Return the rule by which lines go back in the driving environment, with random numbers of their own at every
-    try, and at the first states [R, 1] with goals that ``begin`` draws again, given how often each line [R] went
-    back: the kept ones may be out of reach.
+def going_back(env: DrivingEnv, threshold: float, start: TensorDictBase, begin: Renew) -> Backtrack:
+    """Return the rule by which lines from ``start`` [*b, S] go back in the driving environment, with random numbers
+    of their own at every try, and at the first states [R, 1] with goals that ``begin`` draws again, given how often
+    each line [R] went back: the kept ones may be out of reach.
     """
 
     def renew(state: TensorDictBase, attempt: Int[Tensor, " R"]) -> TensorDictBase:
@@ -231,4 +230,5 @@ def going_back(
             found[first] = begin(found[first], attempt[first])
         return found
 
-    return Backtrack(threshold, renew=renew, width=max(FEW, lines // FILL))
+    lengths = env.scenes.last_step[start.get(keys.SCENE).flatten()]
+    return Backtrack(threshold, renew=renew, lengths=lengths, width=max(FEW, start.numel() // FILL))

@@ -131,7 +131,7 @@ class InteractionReader(Reader):
             first = int(mine.time[0])
             steps = int(mine.time[-1]) - first + 1
             refuse(steps > MAX_STEPS, f"{steps} steps, at most {MAX_STEPS} can be read", "timestamp_ms")
-            mine = tracks.completed(mine, dt, by_positions=self.by_positions)
+            mine, seen = tracks.completed(mine, dt, by_positions=self.by_positions), set[tuple[int, int]]()
             for at, end in self._windows(steps, dt) if files.single else [(0, steps)]:
                 window = first + at, first + end
                 what = f"t{round(at * dt, 3):g}" if files.single else f"case{case}"
@@ -139,6 +139,9 @@ class InteractionReader(Reader):
                 place = [files.tracks.parent.name] * files.single + [files.map.stem]
                 name = "_".join([*dict.fromkeys(place), files.part, what])
                 begin, stop = _observed(mine.between(*window), *window, dt) if files.single else window
+                if (begin, stop) in seen:  # windows that overlap, cut to the same part
+                    continue
+                seen.add((begin, stop))
                 try:
                     yield from self._window(mine.between(begin, stop), scene, name, begin, stop - begin)
                 except DataError as error:

@@ -46,9 +46,8 @@ _BIKE_LANES = frozenset({"bicycle_lane", "bikelane"})
 _EDGES = frozenset({"road_border", "curbstone", "fence", "wall", "guard_rail", "jersey_barrier"})
 _PAINT = frozenset({"line_thin", "line_thick", "stop_line"})
 _STOP_SIGNS = re.compile(r"(de206|r1-1(?!\d)|\bstop\b)", re.IGNORECASE)
-_SPEED = re.compile(r"(?:[a-z][\w.-]*[-_](?=[5-9]|\d\d))?(\d+(?:\.\d+)?)\s*(mph|km/h|kmh|m/s|mps)?", re.IGNORECASE)
-_SIGNS = {"de274.1": "30", "de274_1": "30", "de310": "50"}
-"""Signs whose code does not say the limit they mean, in km/h: those of zones and of towns."""
+_SPEED = re.compile(r"(?i)(?:[a-z][\w.-]*[-_](?=[5-9]|\d\d))?(\d+(?:\.\d+)?)\s*(mph|km/?h|m/s|mps)?")
+_SIGNS = {"de274.1": "30", "de274_1": "30", "de310": "50"}  # km/h of zones and towns, whose signs do not say it
 
 MAX_LATITUDE = 84.0  # degrees up to which UTM is defined
 SEMI_MAJOR, FLATTENING = 6_378_137.0, 1 / 298.257223563  # of the WGS 84 ellipsoid, metres
@@ -269,9 +268,7 @@ def _rule(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> tuple[int, tupl
     rule_id = base.integer(node.get("id"), "relation id")
     members = _members(node, "way", f"regulatory element {rule_id}")
     # Lines outside the map's section are missing in it.
-    found = {
-        role: [ways[ref] for ref in refs if ref in ways and len(ways[ref].line)] for role, refs in members.items()
-    }
+    found = {role: [ways[r] for r in refs if r in ways and len(ways[r].line)] for role, refs in members.items()}
     signs = [sign.tags.get("subtype", "") for sign in found.get("refers", ())]
     return rule_id, ({"sign_type": "".join(signs[:1])} | tags, found.get("ref_line", []))
 

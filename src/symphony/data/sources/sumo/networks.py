@@ -381,8 +381,7 @@ def own_network(file: Path, folder: Path) -> Path:
         own = folder / f"own{ending}"
         arguments = f"{option} {own.name} --output-file net.net.xml {COMMON} --keep-edges.by-vclass passenger"
         if ending == ".osm":
-            arguments += " --remove-edges.isolated true --geometry.remove true --junctions.join true"
-            arguments += " --tls.guess-signals true"
+            arguments += " --geometry.remove true --junctions.join true --tls.guess-signals true"
         if ending == ".xodr":
             # In the map's own coordinates, its turns as it has them.
             arguments += " --offset.disable-normalization true --opendrive.internal-shapes true"
