@@ -9,6 +9,7 @@ import contextlib
 import importlib
 import io
 import os
+import re
 import signal
 import sys
 import threading
@@ -112,7 +113,9 @@ def guarded(action: Callable[[], object]) -> int:
         # The reader of our output, such as `head`, has gone; Python would print another error as it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
-    except (KeyboardInterrupt, RuntimeError) as error:
+    except (KeyboardInterrupt, RuntimeError, MemoryError) as error:
+        if isinstance(error, MemoryError) or re.search("allocate memory|out of memory", str(error)):
+            return _complain(error, FAILED, "out of memory: fewer --rollouts, or a smaller --batch, need less")
         # Where an interrupt comes while TensorDict lends weights to a module, it raises an error of its own.
         stop = error.__context__ if isinstance(error, RuntimeError) else error
         if not isinstance(stop, KeyboardInterrupt):
@@ -141,10 +144,10 @@ def _warn(message: Warning | str, category: type[Warning], *place: Any, **more: 
         sys.stderr.write(warnings.formatwarning(message, category, *place[:2]))
 
 
-def _complain(error: object, status: int) -> int:
+def _complain(error: object, status: int, text: str = "") -> int:
     if isinstance(error, BaseException) and os.environ.get("SYMPHONY_DEBUG", "0") not in {"", "0"}:
         raise error
     if isinstance(error, OSError) and error.strerror:
         error = f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
-    sys.stderr.write("symphony: error: " + errors.printable(f"{error}\n", keep="\n"))
+    sys.stderr.write("symphony: error: " + errors.printable(f"{text or error}\n", keep="\n"))
     return status

@@ -12,19 +12,9 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from symphony import keys
-from symphony.collectors import (
-    Backtrack,
-    BeamSearchResult,
-    KeepBest,
-    KeyScore,
-    PruningRule,
-    ReplaceBad,
-    Systematic,
-    beam_search,
-    max_then_sum,
-)
+from symphony.collectors import Backtrack, BeamSearchResult, KeyScore, PruningRule, beam_search, max_then_sum
 from symphony.collectors.backtracking import Renew
-from symphony.collectors.rules import takes_groups
+from symphony.collectors.rules import KeepBest, ReplaceBad, Systematic, takes_groups
 from symphony.config import Score, SearchConfig
 from symphony.envs.driving import DrivingEnv
 from symphony.envs.flags import collision_flags

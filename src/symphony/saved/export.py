@@ -1,4 +1,5 @@
-"""Single saved rollouts for other tools: CommonRoad scenarios (XML 2020a).
+"""Single saved rollouts for other tools: CommonRoad scenarios (XML 2020a) without planning problems. Agents that come
+later have an initial state at that time, which CommonRoad's reader takes; its schema knows the time 0 only.
 
 Legend: A agents, U states, L lanes, Q lights. Coordinates are those of the source: the segment's, plus its origin.
 """
@@ -75,7 +76,8 @@ def _obstacles(saved: SavedRollouts, rollout: int) -> list[ET.Element]:
     found = []
     for row in np.flatnonzero(world.valid.any(1)).tolist():
         seen = np.flatnonzero(world.valid[row])
-        for k, steps in enumerate(np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1)):
+        parts = np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1)
+        for k, steps in enumerate(part for part in parts if len(part) > 1):  # one state is no trajectory
             node = ET.Element("dynamicObstacle", id=str(next(spare) if k else int(ids[row])))
             kind, (length, width) = AgentType(segment.agent_type[row]), segment.size[row, :2]
             vehicle = "truck" if length >= TRUCK else "car"
@@ -84,7 +86,7 @@ def _obstacles(saved: SavedRollouts, rollout: int) -> list[ET.Element]:
             _add(shape, "length", length)
             _add(shape, "width", width)
             _state(_add(node, "initialState"), world, row, steps[0], segment.origin)
-            trajectory = _add(node, "trajectory") if len(steps) > 1 else node
+            trajectory = _add(node, "trajectory")
             for step in steps[1:]:
                 _state(_add(trajectory, "state"), world, row, step, segment.origin)
             found.append(node)
