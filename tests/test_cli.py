@@ -152,13 +152,14 @@ def test_wrong_usage_is_status_2_and_bounds_are_told_as_they_are_typed(line, tmp
     assert not list(tmp_path.iterdir())
 
 
-MEMORY = "out of memory: fewer --rollouts, or a smaller --batch, need less"
+MEMORY = "out of memory, try less at a time (rollouts, batch, workers): "
 
 
 @pytest.mark.parametrize(("error", "status", "message"), [
     (DataError("is bent", file="a.xml", field="lane"), 1, "file a.xml, field lane: is bent"),
     (FileNotFoundError(2, "No such file or directory", "x/y"), 1, "x/y: No such file or directory"),
-    (MemoryError(), 1, MEMORY), (RuntimeError("CPUAllocator: can't allocate memory"), 1, MEMORY),
+    (MemoryError(), 1, f"{MEMORY}no more to be had"),
+    (RuntimeError("CPU: can't allocate memory\nat 0"), 1, f"{MEMORY}CPU: can't allocate memory"),
     (OSError(28, "No space left on device"), 1, "No space left on device"), (KeyboardInterrupt(), 130, "interrupted"),
     (ZeroDivisionError("is ours"), 0, ""),  # an error of programming is not hidden
 ])  # fmt: skip

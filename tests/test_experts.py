@@ -335,3 +335,11 @@ def test_training_batches_are_the_log_unless_displaced(monkeypatch: pytest.Monke
     for at, line, number, now, then in zip(away[:, 0, :2], lines[:, 0], count[:, 0], far, before, strict=True):
         expected = shapely.LineString(line[:number]).project(shapely.Point(at)) if number > 1 else 0.0
         assert abs(expected - then) > 6 or now == pytest.approx(expected, abs=0.5)
+
+
+def test_goals_are_learned_as_often_as_there_are_experts(tmp_path: Path) -> None:
+    """Ten times 26 of them, 128 at a time; people on foot choose no routes."""
+    road = straight_road(26)
+    walkers = road.replace(segment_id="on foot", agent_type=np.where(np.arange(26) < 13, road.agent_type, 2))
+    data = SceneDataset(fill(tmp_path / "store", [walkers, walkers.replace(segment_id="again")]), 2, Bicycle())
+    assert [data.goal_updates(most, processes) for most, processes in ((9, 1), (2, 1), (9, 3))] == [3, 2, 1]

@@ -102,6 +102,7 @@ def test_lines_that_may_be_crossed(tags: dict[str, str], left: bool, right: bool
 SPEEDS = {"50": 50 / 3.6, "50 km/h": 50 / 3.6, "25 mph": 25 * 0.44704, "8.5 m/s": 8.5, "8.5mps": 8.5}
 SPEEDS |= {"de274-60": 60 / 3.6, "us_r2-1-25": 25 * 0.44704, "none": np.nan, "": np.nan, "900": np.nan}
 SPEEDS |= {"de274.1": 30 / 3.6, "de310": 50 / 3.6, "de274": np.nan, "usR2-1": np.nan, "de274.1-20": 20 / 3.6}
+SPEEDS |= {"DE:zone:30": 30 / 3.6, "speed 40": 40 / 3.6}
 
 
 def test_speed_limits(tmp_path: Path) -> None:
@@ -118,6 +119,7 @@ def test_speed_limits(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("tags", "expected"), [
     ({}, LaneType.SURFACE_STREET), ({"participant:pedestrian": "no"}, LaneType.SURFACE_STREET),
     ({"participant:vehicle:car": "yes", "subtype": "walkway"}, LaneType.SURFACE_STREET),
+    *(({"participant:vehicle": word}, LaneType.SURFACE_STREET) for word in ("True", "1", "?")),
     ({"participant:vehicle": "no"}, None), ({"participant:pedestrian": "yes"}, None),
     ({"participant:pedestrian": "yes", "participant:bicycle": "yes"}, LaneType.BIKE_LANE),
 ])  # fmt: skip

@@ -120,7 +120,9 @@ def test_a_boundary_without_heights_takes_them_from_the_lanes(tmp_path: Path) ->
         features[name]["polyline"] = np.pad(features[name]["polyline"], ((0, 0), (0, 1)), constant_values=20.0)
         features[name].pop("polygon", None)
     del features["boundary_0"], features["boundary_1"]
-    assert levels_of(read_one("scenarionet", write(tmp_path, tree))).flat
+    segment = read_one("scenarionet", write(tmp_path, tree))
+    assert levels_of(segment).flat
+    assert segment.position[segment.ego, 10, 0] == pytest.approx(10 + FROM_AXLE)
     features["edge"] = {"type": "ROAD_EDGE_BOUNDARY", "polyline": np.array([(*FAR, 0.0), (*FAR, 5.0)])}
     road = read_one("scenarionet", write(tmp_path, tree)).road
     assert (road.lanes.points[:, 2] == 20).all()

@@ -235,7 +235,7 @@ def test_too_few_crowds_and_large_maps_are_left_out() -> None:
 
     few = abreast([5, 6, 7], [2, 2, 0], file="log.xml")
     assert (excluded(few, 4), excluded(few, 3)) == ("interactive_agents", "")
-    with pytest.raises(DataError, match="has no ego"):
+    with pytest.raises(DataError, match="ego is not seen"):
         interactive_agents(hide(few, 0, slice(0, 1)), 2)
     crowd = abreast([5.0 + k for k in range(258)], [2.0] * 258, file="log.xml")
     unseen = hide(crowd, 100, slice(None))

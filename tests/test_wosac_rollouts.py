@@ -456,6 +456,9 @@ def test_the_record_has_the_score_and_tables_have_its_columns(tmp_path, capsys, 
     year = kept | {"wosac": scores | {"config": "2024"}}
     with pytest.raises(ConfigError, match="WOSAC scores of 2024, 2025"):
         compare([entries[0], replace(entries[1], record=year)], "main")
+    assert "pace 0.5" in wosac_table(scores | {"how": scores["how"] | {"pace": 0.5}})
+    with pytest.raises(ConfigError, match="twice"):
+        evaluate_wosac(load_agent("playback"), SegmentStore(tmp_path / "store"), [0, 0], WosacSettings())
     # The table of scores.
     for agents, drivers in ((whole, BASELINES), ({RANDOM: whole[RANDOM]}, [])):
         lines = wosac_table(scores | {"agents": agents}).splitlines()

@@ -1,13 +1,10 @@
 """Fail where a file, a room of the package, the tests or the pages have become longer than they may be.
 
-A file has at most 600 lines. What else is bounded is the table of rooms in CONTRIBUTING.md; where a room is still
-larger than its bound, the column `today` bounds it instead, so that it can only shrink: `--update` writes that column
-anew.
+A file has at most 600 lines. What else is bounded is the table of rooms in CONTRIBUTING.md.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import sys
@@ -16,10 +13,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = Path("CONTRIBUTING.md")
-ROW = re.compile(
-    r"^(\| `(?P<room>\w+)/?` \|.*\|) (?P<bound>[\d ]+?)(?P<unit> words)? \| (?P<today>[\d ]*?) ?\|$", re.M
-)
-"""A row of the table: a room, what it owns and may import, its bound, and its size today if that is larger."""
+ROW = re.compile(r"^\| `(?P<room>\w+)/?` \|.*\| (?P<bound>[\d ]+?)(?P<unit> words)? \|$", re.M)
+"""A row of the table: a room, what it owns and may import, and its bound."""
 FOLDERS = ("src", "tests", "recipes", "examples", "benchmarks")
 LIMIT = 600
 RECIPE = 80  # lines of a recipe, in which a method is to be seen at a glance
@@ -70,7 +65,7 @@ def large_rooms(root: Path) -> list[str]:
     rows = {row["room"]: row for row in ROW.finditer(table)}
     found = []
     for room, row in rows.items():
-        most, now = number(row["today"]) or number(row["bound"]), size(root, room)
+        most, now = int(row["bound"].replace(" ", "")), size(root, room)
         if now > most:
             found.append(f"{room}: {now} {row['unit'] or ' lines'}, may have {most}".replace("  ", " "))
     package = root / "src" / "symphony"
@@ -79,28 +74,8 @@ def large_rooms(root: Path) -> list[str]:
     return found + [f"{name}: has no place in the table of {TABLE}" for name in missing]
 
 
-def number(cell: str) -> int:
-    """Return the number in a cell; 0 where it is empty."""
-    return int(cell.replace(" ", "") or 0)
-
-
-def updated(root: Path) -> str:
-    """The page with the column `today` as it is: empty where a room keeps to its bound."""
-
-    def row(found: re.Match[str]) -> str:
-        now = size(root, found["room"])
-        today = f" {now:,} ".replace(",", " ") if now > number(found["bound"]) else " "
-        return f"{found[1]} {found['bound']}{found['unit'] or ''} |{today}|"
-
-    return ROW.sub(row, (root / TABLE).read_text(encoding="utf-8"))
-
-
-def main(args: list[str] | None = None) -> int:
+def main() -> int:
     """Report on the repository this program lies in; status 1 if anything is too long."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--update", action="store_true", help="write sizes of today into the table")
-    if parser.parse_args(args).update:
-        (ROOT / TABLE).write_text(updated(ROOT), encoding="utf-8")
     found = long_files(ROOT) + large_rooms(ROOT)
     print(*found, sep="\n", end="\n" if found else "", file=sys.stderr)
     return 1 if found else 0

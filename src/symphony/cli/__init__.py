@@ -115,7 +115,8 @@ def guarded(action: Callable[[], object]) -> int:
         return FAILED
     except (KeyboardInterrupt, RuntimeError, MemoryError) as error:
         if isinstance(error, MemoryError) or re.search("allocate memory|out of memory", str(error)):
-            return _complain(error, FAILED, "out of memory: fewer --rollouts, or a smaller --batch, need less")
+            first = str(error).strip().partition("\n")[0] or "no more to be had"
+            return _complain(error, FAILED, f"out of memory, try less at a time (rollouts, batch, workers): {first}")
         # Where an interrupt comes while TensorDict lends weights to a module, it raises an error of its own.
         stop = error.__context__ if isinstance(error, RuntimeError) else error
         if not isinstance(stop, KeyboardInterrupt):

@@ -161,6 +161,8 @@ class Report(shared.Command):
         from symphony.saved.folder import load_rollouts
 
         folder, out = load_rollouts(self.folder), self.out or self.folder
+        if not folder.entries and not folder.failures:
+            raise errors.DataError("holds no rollouts: nothing to judge", file=self.folder)
         with files.Lock(out / "report.lock"):
             with shared.progress("evaluating") as advance:
                 found = report(folder, self.evaluated, advance)

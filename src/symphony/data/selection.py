@@ -251,8 +251,8 @@ def interactive_choice(segment: RunSegment, count: int, *, fewer: bool = False) 
     chosen = [segment.ego] if partner is None else [segment.ego, partner]
     chosen += [agent for agent in moves.tolist() if agent != partner]
     if (len(chosen) < count and not fewer) or not has_ego:
-        has = len(chosen) if has_ego else "no ego"
-        message = f"needs {count} interactive agents at its first step, has {has}"
+        few = f"needs {count} interactive agents at its first step, has {len(chosen)}"
+        message = few if has_ego else "its ego is not seen at its first step"
         raise DataError(message, file=segment.file or None, segment=segment.segment_id, field="agents")
     return InteractiveChoice(np.asarray(chosen[:count], np.int64), context)
 

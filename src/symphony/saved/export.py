@@ -1,5 +1,6 @@
 """Single saved rollouts for other tools: CommonRoad scenarios (XML 2020a) without planning problems. Agents that come
-later have an initial state at that time, which CommonRoad's reader takes; its schema knows the time 0 only.
+later have an initial state at that time, which CommonRoad's reader takes; its schema knows the time 0 only. What is
+seen at a single state is left out.
 
 Legend: A agents, U states, L lanes, Q lights. Coordinates are those of the source: the segment's, plus its origin.
 """

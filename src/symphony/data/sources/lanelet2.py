@@ -46,7 +46,8 @@ _BIKE_LANES = frozenset({"bicycle_lane", "bikelane"})
 _EDGES = frozenset({"road_border", "curbstone", "fence", "wall", "guard_rail", "jersey_barrier"})
 _PAINT = frozenset({"line_thin", "line_thick", "stop_line"})
 _STOP_SIGNS = re.compile(r"(de206|r1-1(?!\d)|\bstop\b)", re.IGNORECASE)
-_SPEED = re.compile(r"(?i)(?:[a-z][\w.-]*[-_](?=[5-9]|\d\d))?(\d+(?:\.\d+)?)\s*(mph|km/?h|m/s|mps)?")
+_SPEED = re.compile(r"(?i)(?:[a-z][\w.: -]*[-_: ](?=[5-9]|\d\d))?(\d+(?:\.\d+)?)\s*(mph|km/?h|m/s|mps)?")
+_TRUTH = dict(zip(("yes", "true", "1", "no", "false", "0"), 3 * [True] + 3 * [False], strict=True))
 _SIGNS = {"de274.1": "30", "de274_1": "30", "de310": "50"}  # km/h of zones and towns, whose signs do not say it
 
 MAX_LATITUDE = 84.0  # degrees up to which UTM is defined
@@ -250,11 +251,11 @@ def _area(node: ET.Element, tags: Tags, ways: dict[int, Way]) -> shapely.Polygon
 
 
 def _admits(tags: Tags, who: str, by_subtype: bool) -> bool:
-    """Return who may be there: as soon as a tag admits one participant, the subtype counts no more."""
-    told = {name: value == "yes" for name, value in tags.items() if name.startswith("participant:")}
+    """Return whether somebody may be there: as soon as a tag admits one participant, the subtype counts no more."""
+    told = {name: _TRUTH.get(value.lower()) for name, value in tags.items() if name.startswith("participant:")}
     if any(told.values()):
         return any(yes and name.startswith(f"participant:{who}") for name, yes in told.items())
-    return by_subtype and told.get(f"participant:{who}", True)
+    return by_subtype and told.get(f"participant:{who}") is not False
 
 
 def _closed(refs: list[int], ways: dict[int, Way], field: str) -> list[shapely.Polygon]:
@@ -332,9 +333,9 @@ def _beside(lanes: Sequence[Lanelet], left: bool) -> Links:
 def _may_cross(bound: Way, turned: bool, to_left: bool) -> bool:
     """Return whether the line between two lanes may be crossed; of unknown and unmarked ones it is assumed."""
     side = "left" if to_left != turned else "right"
-    explicit = bound.tags.get(f"lane_change:{side}", bound.tags.get("lane_change"))
-    if explicit in {"yes", "no"}:
-        return explicit == "yes"
+    explicit = _TRUTH.get(bound.tags.get(f"lane_change:{side}", bound.tags.get("lane_change", "")).lower())
+    if explicit is not None:
+        return explicit
     if bound.tags.get("type") in _EDGES:
         return False
     # The names give the left line first, seen along the way as it is drawn: the near one counts.

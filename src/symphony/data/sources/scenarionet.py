@@ -8,8 +8,7 @@ Pickles can do anything; these are read by :mod:`.safe_pickle`, which admits pla
 - A box size is the median over the valid states. An ego wider than long (ScenarioNet swaps the two for nuScenes) is
   turned. NuScenes logs the ego's rear axle (see :func:`.base.from_rear_axle`). Its velocities are differences to
   the next position; at the last state of a track, where ScenarioNet writes 0, that of the state before is taken.
-- Coordinates are relative to the ego's first position, rounded to metres, z as logged; maps without road edges get
-  none (nuScenes has none, and Argoverse 2 none for its agents).
+- Coordinates are relative to the ego's first position in whole metres; z is as logged, 0 in maps without road edges.
 - Successors and neighbours are the source's, or derived from the geometry where it has none (nuScenes) or names all
   lanes of a road (MetaDrive; neighbours of nuPlan): see :func:`_successors`, :func:`_neighbors`. The boundary is the
   road edges, or goes round the union of the drivable areas (``boundary_…``, if all are closed) and the lanes' areas,
