@@ -182,6 +182,8 @@ def test_what_can_not_be_right_is_refused():
         look(start, keep=[STREAM, *OUTCOME])
     with pytest.raises(ValueError, match="rule Backtrack"):
         look(start, leaves=1)
+    with pytest.raises(ValueError, match="lengths are those of 3 lines, there are 4"):
+        look(start, replace(RULE, lengths=torch.full((3,), 12)))
     for wrong in [(0, ()), (0, (0, 1)), (0, (1, -1)), (0, (1,), -1.0), (0, (1,), 6.0, None, 0), (math.nan,)]:
         with pytest.raises(ValueError, match="back and width begin at 1, cap at 0, and the threshold is a number"):
             Backtrack(*wrong)

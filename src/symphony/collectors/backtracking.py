@@ -132,6 +132,8 @@ def follow(
     lines, device = start.numel(), ended.device
     periods, short = -(-steps // every), steps % every
     entries, length = list(start.keys(True, True)), periods * every
+    if rule.lengths is not None and len(rule.lengths) != lines:
+        raise ValueError(f"lengths are those of {len(rule.lengths)} lines, there are {lines}")
     order = torch.arange(lines, device=device)
     line, waiting = order[: rule.width], order[rule.width or lines :]
     now, over = take(start, line[:, None]), take_values(ended, line[:, None], start.ndim)

@@ -7,8 +7,7 @@
 - The ego is the recording vehicle, track ``AV``, which gets the id :data:`EGO_ID`. Agents are in order of id. The
   focal track is the agent of interest; focal and scored tracks are for prediction, in that order.
 - The format has **no box sizes** (see :data:`NOMINAL_SIZES`) and no heights. Of the ego it has the rear axle (see
-  :func:`.base.from_rear_axle`). Coordinates are relative to the ego's
-  first position, rounded to metres.
+  :func:`.base.from_rear_axle`). Coordinates are relative to the ego's first position, rounded to metres.
 - A lane's line is the file's ``centerline`` or, where it has none, the middle of its bounds. Neighbours are those of
   the same direction only. Maps are cropped: references to lanes beyond are left out, and the edge of the crop is no
   road boundary. Painted lane bounds and crossings are marks.
