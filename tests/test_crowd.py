@@ -237,9 +237,11 @@ def test_others_are_driven_but_not_evaluated(store, others, tmp_path):
     """The log against itself is at no distance, whatever drives the rest, and goals are those of the evaluated."""
     config = EvaluateConfig(rollouts=2, search="none", interactive=2, others=others)
     assert evaluate("playback", brief(tmp_path / "brief", [0]), config).numbers()["curvature_jsd"] == 0
-    saved = save_simulation(tmp_path / "sim", tiny(), crowd_dataset(store, tiny(), config, [2]), config)[0]
+    folder = save_simulation(tmp_path / "sim", tiny(), crowd_dataset(store, tiny(), config, [2]), config)
+    saved = folder[0]
     assert saved.evaluated.tolist() == [0, 1]
     assert set(saved.drivers[2:]) == {f"background:{others}"}
+    assert folder.about.drivers["others"] == others
     kept = replace(config, rollouts=4, search="tree", rule="replace", threshold=np.inf)  # nothing is bad
     found = evaluate(tiny(), store, kept).metrics.segments
     counts = {name: (one.choice.founders, one.sums["agent_collision_rate"][1]) for name, one in found.items()}

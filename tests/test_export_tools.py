@@ -9,6 +9,7 @@ import numpy as np
 
 from helpers_saved import played, searched
 from helpers_segments import crossing, hide, straight_road, turned
+from symphony.data.resample import mirrored
 from symphony.saved.openscenario import openscenario
 from symphony.saved.rollouts import world_of
 
@@ -57,6 +58,7 @@ def test_openscenario_has_every_agent_where_it_was():
         assert root.find("RoadNetwork/LogicFile") is None
         assert "no OpenDRIVE" in root.find("FileHeader").get("description")
     segment = straight_road(3).replace(file="roads.xodr")
+    assert "no OpenDRIVE" in openscenario(played(mirrored(segment)), 0)  # the file has the roads as they were
     (root, before), (_, after) = (poses(openscenario(played(turned(segment, a)), 0)) for a in (0.0, 1.0))
     assert root.find("RoadNetwork/LogicFile").get("filepath") == "roads.xodr"
     for name, states in before.items():

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 
 import pytest
 import torch
 from tensordict import TensorDict
-from torch.distributions import Categorical
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch import nn
+from torch.distributions import Categorical, LogNormal, Weibull
 from torch.nn import functional
-from torchrl.modules import OneHotCategorical
+from torchrl.modules import OneHotCategorical, ProbabilisticActor
 from torchrl.objectives import BCLoss as TorchRLBCLoss
 
 from helpers_objectives import OBSERVATION, batch, categorical_actor, check_contract, gaussian_actor, learned
@@ -139,6 +142,23 @@ def test_a_mask_counts_where_there_is_one():
     keep = torch.rand(4, 5, 1) < 0.5
     found = bc(td.clone().set(("collector", "mask"), keep))
     torch.testing.assert_close(found, bc(td, td[VALID] & keep))
+
+
+@pytest.mark.parametrize("kind", [LogNormal, Weibull])
+def test_padding_leaves_gradients_finite_where_zero_has_no_likelihood(kind):
+    td = TensorDict(observation=torch.randn(3, 4), action=torch.rand(3, 2) + 0.5, batch_size=[3])
+    td[VALID], parameters = torch.tensor([[True], [False], [True]]).expand(3, 2), ["loc", "scale"]
+    gradients = []
+    for one in (td, td[[0, 2]]):
+        torch.manual_seed(0)
+        network = nn.Sequential(nn.Linear(4, 4), nn.Softplus(), NormalParamExtractor())
+        names = dict(zip(inspect.signature(kind).parameters, parameters, strict=False))
+        module = TensorDictModule(network, ["observation"], parameters)
+        loss = BCLoss(ProbabilisticActor(module, names, distribution_class=kind))
+        loss.set_keys(action="action")
+        loss(one)["loss_bc"].backward()
+        gradients.append([parameter.grad for parameter in loss.parameters()])
+    torch.testing.assert_close(*gradients)
 
 
 def test_bad_inputs_are_refused():

@@ -137,6 +137,8 @@ def test_as_many_want_to_enter_as_the_rate_says_and_a_longer_time_keeps_who_did(
 def test_with_rate_0_nobody_enters_and_within_the_log_nothing_changes(tmp_path):
     segment = straight_road(6)
     store, how = fill(tmp_path / "store", [segment, crossing(4)]), {"interactive": "all", "duration": 6}
+    with pytest.raises(ConfigError, match="three lengths"):
+        SimulateConfig(**how, lights=(np.inf, 3, 2))
     pair = EvaluateConfig(**how), SimulateConfig(**how, inflow=1.0, lights=(5, 3, 2))
     one, two = (crowd_dataset(store, DRIVER, config).scenes([0, 1]) for config in pair)
     assert all(torch.equal(one.get(name), two.get(name)) for name in one.keys())  # noqa: SIM118

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from functools import partial
 from pathlib import Path
@@ -384,14 +385,19 @@ class Halting(Forgetful):
     def reset(self, scenario: Scenario) -> None: ...
 
 
-def test_one_that_can_not_begin_fails_all_of_its_run() -> None:
+@pytest.mark.parametrize("text", ["not today", None])
+def test_one_that_can_not_begin_fails_all_of_its_run(text: str | None) -> None:
+    class RefusalError(RuntimeError):
+        def __str__(self) -> str:
+            return text  # type: ignore[return-value]  # an exception that can't say what it is
+
     class Unready(Wanderer):
         def reset(self, scenario: Scenario) -> None:
-            raise RuntimeError("not today")
+            raise RefusalError
 
     found = simulated(Unready, count=1, rollouts=2, search="tree", branches=4)
     assert set(found.failed[0].values()) == {found.failed[0][0]}
-    assert "reset: RuntimeError: not today" in found.failed[0][0]
+    assert re.search(f"reset: RefusalError: {text or '<exception str'}", found.failed[0][0])
     assert not found.rollouts.counted.any()
 
 

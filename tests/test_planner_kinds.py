@@ -316,7 +316,7 @@ def test_a_segment_that_failed_is_no_recording_of_its_own(tmp_path: Path) -> Non
     assert {bool(one["failed"]): one["group"] for one in record["per_run"][1:]} == {False: "b", True: "a"}
     apart = {"a": 0.0, "b": 0.0}
     for one in record["per_run"]:
-        apart[one["group"]] += (compared.run_score(one) - record["score"]) / 1.5
+        apart[one["group"]] += (compared.run_score(one) - record["score"]) / (1 if one["group"] == "a" else 2)
     assert record["score_se"] == pytest.approx(np.sqrt(sum(x**2 for x in apart.values()) / 2))
 
 
@@ -353,6 +353,9 @@ def test_runs_without_defined_progress_have_no_score(tmp_path: Path) -> None:
         runs = [{"segment": f"{k}", "group": f"{k % 4}", "progress_ratio": 0.5 + ahead[k % 2]} for k in range(8)]
         one |= {"per_run": [FINE | run for run in runs], "score": 50 + ahead[0]}
     assert compared.winners([other, record])[0].startswith("log: hurries is first, within the error, 3.1 ± 1.2")
+    assert compared.paired_difference(record, other)[2] == 4
+    uneven = record | {"per_run": [run | {"group": f"{max(k, 5)}"} for k, run in enumerate(record["per_run"])]}
+    assert compared.paired_difference(uneven, other)[2] == pytest.approx(8**2 / (6**2 + 1 + 1))
     record["per_run"] = [run | {"progress_ratio": 0.6} for run in record["per_run"]]  # in all groups as much ahead
     assert compared.winners([other, record])[0].startswith("log: hurries is first, its error unknown, 10.0 above")
 

@@ -141,6 +141,8 @@ def test_progress_is_along_the_route_and_relative_to_the_log(lines: list[Any]) -
     ways.state[0, 6:, 0, :2] = ways.state[0, :5, 0, :2]
     row = rows(ways)[0]
     assert (row["progress"], row["progress_ratio"]) == pytest.approx((16, 0.4), abs=1e-4)
+    ways.counted[0] = False  # one that never comes is no agent that stands
+    assert rows(ways)[0]["progress"] is None
 
 
 def red(states: Any = SignalState.STOP, others: Any = SignalState.GO, aside: float = 0) -> list[tuple[int, int]]:
@@ -244,9 +246,8 @@ def test_failed_runs_and_groups_are_told_apart(tmp_path: Path) -> None:
     totals = (found := report(load_rollouts(tmp_path / "sim"))).totals()
     assert (totals["runs"], totals["failed_runs"], totals["segments"], totals["groups"]) == (7, 4, 3, 2)
     assert (totals["collision_rate"], found.parts[0]["collisions"]) == (pytest.approx(100 * 2 / 3), 2)
-    # Groups of 2 and 1 runs, all and none of which collided.
-    residual = (np.array([2, 0]) - 2 / 3 * np.array([2, 1])) / 1.5
-    assert totals["collision_rate_se"] == pytest.approx(100 * np.sqrt((residual**2).sum() / 2))
+    # Groups of 2 and 1 runs, all and none of which collided: without either of them the rate is 0 or 1.
+    assert totals["collision_rate_se"] == pytest.approx(100 * np.sqrt(((2 / 3) ** 2 + (1 / 3) ** 2) / 2))
     assert [row["segment"] for row in found.worst()[:5]] == ["hit", "free", "lost", "lost", "hit"]
     assert found.plain()["collisions"] == [
         {"kind": "into leader", "other": "vehicle", "at_fault": True, "with_playback": True, "collisions": 2}
@@ -481,6 +482,10 @@ def test_errors_over_groups_of_one_are_the_usual_ones(values: list[float]) -> No
     # Copies within a group tell nothing new.
     twice = clustered_mean(np.repeat(numbers, 2), np.repeat(np.arange(len(numbers)), 2))
     assert twice == pytest.approx((mean, error), abs=1e-9)
+    # One group that holds nearly all still has an error: that of leaving out each in turn.
+    member = np.minimum(np.arange(len(numbers)), 1)
+    shift = abs(numbers[0] - numbers[1:].mean()) * np.array([len(numbers) - 1, 1]) / len(numbers)
+    assert clustered_mean(numbers, member)[1] == pytest.approx(np.sqrt((shift**2).sum() / 2), abs=1e-9)
 
 
 def test_the_paper_s_own_figures_have_the_paper_s_relations() -> None:

@@ -193,7 +193,7 @@ def beam_search(
             kept = None if prune_last else last | run.ended.flatten(-2).all(-1)  # rows whose last period this was
             parents = pruning.prune(simulator.total(run), active, worth, kept)
             if not last:
-                place = _places(parents, start)
+                place = places(parents, start)
                 now, ended = take(run.after, place), take_values(run.ended, place, start.ndim)
                 now = now.update(run.after.select(*slot_keys))
                 if worth is not None and run.terminated is not None:
@@ -207,7 +207,7 @@ def beam_search(
     slots, costs, log_weights, evidence = _leaves(pruning, worth, leaves)
     # The place of each leaf's steps in the flattened tree [*b, S, T].
     step = torch.arange(steps, device=slots.device)
-    place = _places(slots, start).transpose(-1, -2)[..., step // prune_every] * steps + step
+    place = places(slots, start).transpose(-1, -2)[..., step // prune_every] * steps + step
     trajectories = take(tree, place)
     trajectories.refine_names(..., "time")
     return BeamSearchResult(
@@ -372,7 +372,7 @@ def _ended(env: EnvBase, state: TensorDictBase, batch: int, how: str = "done") -
     return torch.cat(flags, -1)
 
 
-def _places(slots: Int[Tensor, "*b _"], start: TensorDictBase) -> Int[Tensor, "*b _"]:
+def places(slots: Int[Tensor, "*b _"], start: TensorDictBase) -> Int[Tensor, "*b _"]:
     """Return the places of slots [*b, L] or [*b, P, L] in the flattened branches [*b, S]."""
     first = torch.arange(0, start.numel(), start.shape[-1], device=slots.device)
     return first.reshape(*start.shape[:-1], *(1,) * (slots.ndim - start.ndim + 1)) + slots

@@ -127,6 +127,7 @@ def branched_env(env: EnvBase, shape: Sequence[int], *, share: bool = True) -> E
         if isinstance(copy, TensorDictPrimer) and copy.primers.shape == env.batch_size:
             # It adds the batch of its environment to its specs, but can't replace another one.
             copy.primers = copy.primers[first] if first else copy.primers.clone()
+            copy.expand_specs = True
         if isinstance(copy, ActionScaling) and copy.initialized and copy.loc.shape[: len(first)] == env.batch_size:
             copy.loc, copy.scale = copy.loc[first], copy.scale[first]
         if isinstance(copy, VecNorm | VecNormV2) and not share:

@@ -178,12 +178,12 @@ class BeamSearchCollector(Collector):
 
     def _truncate(self, leaves: TensorDictBase) -> TensorDictBase:
         """Declare the last step truncated, if the collector is to."""
-        last = torch.arange(leaves.shape[-1]) == leaves.shape[-1] - 1
-        last = last.to(leaves.get(("collector", "mask")).device).expand(leaves.shape)
+        last = (torch.arange(leaves.shape[-1]) == leaves.shape[-1] - 1).expand(leaves.shape)
         for key in self._done if self.set_truncated else ():
             if last_name(key) == "truncated":
                 for name in (key, (*key[:-1], "done")):
-                    leaves.set(name, leaves.get(name) | expand_as_right(last, leaves.get(name)))
+                    ended = leaves.get(name)
+                    leaves.set(name, ended | expand_as_right(last, ended).to(ended.device))
         return leaves
 
     def _acting(self) -> Policy:

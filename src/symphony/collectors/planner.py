@@ -10,8 +10,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import MPCPlannerBase
 
-from symphony.collectors.beam_search import Policy, beam_search
-from symphony.collectors.branching import branch, branched_env, check_branching, parts_of
+from symphony.collectors.beam_search import Policy, beam_search, places
+from symphony.collectors.branching import branch, branched_env, check_branching, parts_of, take
 from symphony.collectors.rules import Aggregate, KeepBest, KeyScore, PruningRule
 
 
@@ -66,6 +66,7 @@ class BeamSearchPlanner(MPCPlannerBase):
         """Return the first action of the best branch from states [*b]; the targets are written into them."""
         root = tensordict.exclude("planner", "next", *self.env.action_keys)
         start, periods = branch(root, self.branches), -(-self.planning_horizon // self.prune_every)
+        memory = [key for key in getattr(self.policy, "out_keys", ()) if key[0] == "next"]
         found = beam_search(
             self.env,
             self.policy or branched_env(self.env, start.shape).rand_action,
@@ -79,7 +80,7 @@ class BeamSearchPlanner(MPCPlannerBase):
             accumulate=True,
             noise=None if self.noise is None else self.noise(tensordict, periods),
             prune_last=False,
-            keep=[self.action_key],
+            keep=[self.action_key, *memory],
             keep_tree=True,
             leaves=self.branches,
         )
@@ -89,8 +90,9 @@ class BeamSearchPlanner(MPCPlannerBase):
         weight = torch.zeros_like(share).scatter_add(-1, roots, share)
         targets = {"action": first, "weight": weight, "value": -found.leaf_costs[..., :1]}
         tensordict.set("planner", TensorDict(targets, root.shape))
-        best = roots[..., :1].reshape(*root.shape, 1, *(1,) * (first.ndim - root.ndim - 1))
-        return first.take_along_dim(best, root.ndim).squeeze(root.ndim)
+        best = take(found.tree[..., 0], places(roots[..., :1], start))[..., 0]
+        tensordict.update(best.select(*memory))  # what the policy remembers of the step that is made
+        return best.get(self.action_key)
 
     def _cost(self, state: TensorDictBase) -> Tensor:
         assert self.value_network is not None  # noqa: S101  (not asked for otherwise)

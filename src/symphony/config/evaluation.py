@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
@@ -159,7 +160,9 @@ class SimulateConfig(EvaluateConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.lights and not (len(self.lights) == 3 and self.lights[0] > 0 and all(x >= 0 for x in self.lights)):
+        if self.lights and not (
+            len(self.lights) == 3 and self.lights[0] > 0 and all(0 <= x < math.inf for x in self.lights)
+        ):
             raise ConfigError(f"lights are three lengths in seconds, green above 0: not {self.lights}")
 
 

@@ -176,12 +176,13 @@ def winners(records: Sequence[Record]) -> list[str]:
     return found
 
 
-def paired_difference(one: Record, other: Record) -> tuple[float | None, float | None, int]:
+def paired_difference(one: Record, other: Record) -> tuple[float | None, float | None, float]:
     """Return the mean score of the first less that of the second, paired over segments in which both have one, its
-    standard error over groups, and how many of these there are.
+    standard error over groups, and the effective number of equal ones.
     """
     mine, theirs = _scores(one), _scores(other)
     group = {run["segment"]: run["group"] or run["segment"] for run in one["per_run"]}
     apart = {k: a - b for k, a in mine.items() if a is not None and (b := theirs.get(k)) is not None}
-    names, member = np.unique([group[segment] for segment in apart], return_inverse=True)
-    return *grouped_mean(np.array(list(apart.values())), np.ones(len(apart)), member), len(names)
+    _, member = np.unique([group[segment] for segment in apart], return_inverse=True)
+    effective = len(member) ** 2 / max((np.bincount(member) ** 2).sum(), 1)
+    return *grouped_mean(np.array(list(apart.values())), np.ones(len(apart)), member), float(effective)

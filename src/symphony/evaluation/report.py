@@ -171,7 +171,7 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
         steps = int(counted.sum())
         lane_steps = steps * (len(lanes.graph.usable_lanes) > 0)
         # Of an agent whose progress is not defined, the log's does not count either.
-        known = np.isfinite(driven[k])
+        known, came = np.isfinite(driven[k]), counted.any(1)
         whole = float(of_log[k][known].sum())
         numbers: Row = {
             "segment": name,
@@ -188,7 +188,7 @@ def add_segment(found: Report, saved: SavedRollouts) -> None:
             "blocking_time": _percent(stands[rows, 1:] & counted, lane_steps),
             "min_ttc": _most(-ttc, -1.0),
             "low_ttc_time": _percent(ttc < LOW_TTC, steps),
-            "progress": float(driven[k][known].mean()) if known.any() else None,
+            "progress": float(driven[k][known & came].mean()) if (known & came).any() else None,
             "log_progress": whole,
             "progress_ratio": float(compared[k][known].sum()) / whole if whole > 1 else None,
             "beyond_route": int((~known).sum()),

@@ -19,7 +19,7 @@ def summed(values: NDArray[Any], member: NDArray[np.int64]) -> NDArray[Any]:
 
 
 def ratio(total: NDArray[np.float64], weight: NDArray[np.float64], member: NDArray[np.int64]) -> tuple[float, float]:
-    """Return a ratio of sums and its standard error over groups (linearised; NaN for a single one).
+    """Return a ratio of sums and its standard error over groups (jackknife; NaN for a single one).
 
     Takes what each segment adds to numerator and denominator, and the number of its group. Groups without anything to
     count are not samples: of two recordings of which one is empty there is no error.
@@ -31,9 +31,10 @@ def ratio(total: NDArray[np.float64], weight: NDArray[np.float64], member: NDArr
     some = (total != 0) | (weight != 0)
     total, weight = total[some], weight[some]
     count = len(total)
-    if count < 2:
+    if count < 2 or weight.max() == weight.sum():
         return float(rate), math.nan
-    residual = (total - rate * weight) / weight.mean()
+    # What the ratio would change by without the group: linearised, one that holds nearly all would have no error.
+    residual = (total - rate * weight) * (count - 1) / (weight.sum() - weight)
     return float(rate), float(np.sqrt((residual**2).sum() / (count - 1) / count))
 
 

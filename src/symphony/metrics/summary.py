@@ -249,10 +249,9 @@ class RolloutMetrics:
         """Return the table row.
 
         Returns:
-            Percentages, distances in metres, most with a standard error over groups under ``*_se`` (linearised for
-            the ratios, jackknife for the divergence). Of the collision rates and times off the road that are zero
-            ``*_bound`` is the exact bound with 95 % confidence over groups
-            (:func:`symphony.metrics.intervals.zero_bound`), else NaN.
+            Percentages, distances in metres, most with a standard error over groups under ``*_se`` (jackknife). Of
+            the collision rates and times off the road that are zero ``*_bound`` is the exact bound with 95 %
+            confidence over groups (:func:`symphony.metrics.intervals.zero_bound`), else NaN.
 
             The paper's: ``collision_rate``, rollouts with at least one collision of an interactive agent;
             ``offroad_time``, of agent-steps; ``ade`` and ``min_sade``, means over agent-steps of all segments;

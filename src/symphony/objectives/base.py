@@ -181,9 +181,11 @@ class ActorLoss(MaskedLoss):
             raise ValueError(
                 f"action {self.tensor_keys.action!r} has shape {tuple(action.shape)}, the actor's are {expected}"
             )
-        # A padded entry may hold anything, such as an invalid index.
+        # A padded entry may hold anything, such as an invalid index, and 0 may lie outside the support.
         fitted = counted.reshape(counted.shape + (1,) * (action.ndim - counted.ndim))
-        action = torch.where(fitted, action, torch.zeros_like(action))
+        if counted.numel():
+            one = action.reshape(counted.numel(), *action.shape[counted.ndim :])[counted.flatten().int().argmax()]
+            action = torch.where(fitted, action, torch.where(counted.any(), one, 0))
         cost = -dist.log_prob(action)
         if not isinstance(dist, Categorical):
             return Fit(cost, counted, None, None)

@@ -64,7 +64,7 @@ class About:
         cls, agent: str, store: SegmentStore, settings: Mapping[str, Any], *, seed: int = 0, planner: str = ""
     ) -> About:
         """Return the facts of rollouts of one agent beside log playback, and of a planner of the ego, if any."""
-        drivers = {"interactive": agent, "others": "playback"}
+        drivers = {"interactive": agent, "others": str(settings.get("others", "log")).replace("log", "playback")}
         if planner:
             agent, drivers = f"{planner} among {agent}", {"ego": planner, **drivers}
         plain = json.loads(json.dumps(settings, default=str))  # as it is read back, to be compared

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from symphony.data.resample import MIRRORED
 from symphony.data.segment import AgentType
 from symphony.saved.export import TRUCK
 from symphony.saved.rollouts import SavedRollouts, world_of
@@ -24,7 +25,7 @@ def openscenario(saved: SavedRollouts, rollout: int) -> str:
     made of, by its name, or none. Its lights run their own programs: no log knows the ids of its signals.
     """
     segment, world, dt = saved.segment, world_of(saved, rollout), float(saved.segment.dt)
-    mapped = segment.file.endswith(".xodr")
+    mapped = segment.file.endswith(".xodr") and not segment.segment_id.endswith(MIRRORED)
     about = f"symphony: segment {segment.segment_id}, rollout {rollout}"
     about += "" if mapped else "; its source has no OpenDRIVE map"
     entities, init, groups = _node("Entities"), _node("Actions"), []
