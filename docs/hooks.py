@@ -28,7 +28,6 @@ FURTHER = {
     "modules": ("realism.discriminator",),
     "collectors": ("beam_search.beam_search",),
     "roadgraph": ("routes.routes",),
-    "metrics": ("choices.choices",),
     "planners": (
         "gym.DrivingGym",
         *(f"interface.{name}" for name in ("Planner", "Scenario", "Traffic", "Pose", "Control")),

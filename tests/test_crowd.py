@@ -234,7 +234,7 @@ def test_who_is_driven_is_a_matter_of_choice():
 
 @pytest.mark.parametrize("others", ["constant_velocity", "idm", "learned"])
 def test_others_are_driven_but_not_evaluated(store, others, tmp_path):
-    """The log against itself is at no distance, whatever drives the rest, and goals are those of the evaluated."""
+    """The log against itself is at no distance, whatever drives the rest."""
     config = EvaluateConfig(rollouts=2, search="none", interactive=2, others=others)
     assert evaluate("playback", brief(tmp_path / "brief", [0]), config).numbers()["curvature_jsd"] == 0
     folder = save_simulation(tmp_path / "sim", tiny(), crowd_dataset(store, tiny(), config, [2]), config)
@@ -244,9 +244,8 @@ def test_others_are_driven_but_not_evaluated(store, others, tmp_path):
     assert folder.about.drivers["others"] == others
     kept = replace(config, rollouts=4, search="tree", rule="replace", threshold=np.inf)  # nothing is bad
     found = evaluate(tiny(), store, kept).metrics.segments
-    counts = {name: (one.choice.founders, one.sums["agent_collision_rate"][1]) for name, one in found.items()}
-    assert counts == dict.fromkeys(store.ids, (4, 2 * 4))
-    assert 0 < max(int(segment.choice.drawn.sum()) for segment in found.values()) <= 2 * 4
+    counts = {name: one.sums["agent_collision_rate"][1] for name, one in found.items()}
+    assert counts == dict.fromkeys(store.ids, 2 * 4)
 
 
 def test_what_is_saved_shows_who_is_there(store, tmp_path):

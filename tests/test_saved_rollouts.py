@@ -105,6 +105,9 @@ def test_another_simulation_or_folder_is_refused(tmp_path):
     save_all(tmp_path / "sim", ABOUT, [played(straight_road())])
     with pytest.raises(DataError, match=r"another simulation, which differs in settings\.rollouts"):
         RolloutWriter(tmp_path / "sim", dataclasses.replace(ABOUT, settings={"rollouts": 3}))
+    RolloutWriter(tmp_path / "sim", dataclasses.replace(ABOUT, store={"checksum": "ab", "path": "moved"})).close()
+    with pytest.raises(DataError, match="differs in store"):
+        RolloutWriter(tmp_path / "sim", dataclasses.replace(ABOUT, store={"checksum": "cd"}))
     with patch("symphony.saved.folder.write_json", side_effect=OSError("full")), pytest.raises(OSError, match="full"):
         RolloutWriter(tmp_path / "full", ABOUT)
     RolloutWriter(tmp_path / "full", ABOUT).close()

@@ -28,7 +28,7 @@ from symphony.errors import ConfigError, DataError, SymphonyError
 from symphony.evaluation.table import WOSAC, Entry, compare
 from symphony.rollouts.driving import simulation
 from symphony.wosac import constant_velocity, evaluate_wosac, log_playback, wosac_rollouts, wosac_window
-from symphony.wosac.evaluate import order_of, passing_gaps, passing_pairs, simulated_how, wosac_scenario
+from symphony.wosac.evaluate import simulated_how, wosac_scenario
 from symphony.wosac.records import logged_scenario, parse_scenario, read_scenarios
 from symphony.wosac.scorer import SimulatedRollouts, compute_features, score
 from symphony.wosac.scorer.scenario import STATES
@@ -36,7 +36,6 @@ from symphony.wosac.simulate import AHEAD, COURSE, PACE, future_log, history_onl
 from symphony.wosac.simulate import between_decisions as between
 from symphony.wosac.submission import check_submission, required_agents
 from symphony.wosac.table import COLUMNS, wosac_table
-from test_selection import CASES, scene
 
 AGENT = "pretrained:bc_ts_h"
 BASELINES = ["log playback", "constant velocity", "intelligent driver model"]
@@ -357,29 +356,6 @@ def test_settings_are_those_of_the_evaluation():
     assert {"rule": "replace", "goals": "branch"}.items() <= how.items()
     with pytest.raises(ConfigError, match="score is one of"):  # Who simulates must not know what is scored.
         WosacSettings.of(EvaluateConfig(score="flags"))
-
-
-@pytest.mark.parametrize("case", ["turns in before", "crosses"])
-def test_who_goes_first_in_the_log_and_when_held_up(case):
-    window = wosac_window(scene(CASES[case][1]))
-    pairs, log, kinds = passing_pairs(window), log_playback(window), window.agent_type.copy()
-    assert [0, 1] in pairs.tolist()
-    kinds[1] = AgentType.PEDESTRIAN
-    assert [0, 1] not in passing_pairs(window.replace(agent_type=kinds)).tolist()
-    pairs = pairs[:1]
-    found = passing_gaps(window, pairs, log)
-    whole = order_of([found])
-    assert (whole.pairs, whole.kept) == (1, 1)
-    assert whole.gap_error < 0.3
-    # Whoever went first comes 5 s later, or never.
-    late = int(pairs[0][0 if float(found.log[0]) > 0 else 1])
-    states = {name: getattr(log, name).copy() for name in STATES}
-    for values in states.values():
-        values[:, late, 50:], values[:, late, :50] = values[:, late, :30].copy(), values[:, late, :1].copy()
-    held = order_of([passing_gaps(window, pairs, replace(log, **states))])
-    assert (held.kept, held.reversed + held.apart) == (0, pytest.approx(1))
-    window = wosac_window(straight_road())
-    assert order_of([passing_gaps(window, passing_pairs(window), constant_velocity(window))]).pairs == 0
 
 
 def test_evaluation(tmp_path):

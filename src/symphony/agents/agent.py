@@ -144,7 +144,7 @@ class Agent:
     goals: TensorDictModuleBase | None = None  # draws routes from first states; None where it follows none
     discriminator: TensorDictModuleBase | None = None  # scores states; None for agents trained without
     # What drives in place of the policy, along the routes of the log (see symphony.rollouts.driving.RULES)
-    rule: Literal["constant_velocity", "idm"] | None = None
+    rule: Literal["idm"] | None = None
 
     @property
     def dynamics(self) -> Bicycle | Displacement:

@@ -110,8 +110,6 @@ def guarded(action: Callable[[], object]) -> int:
             action()
             sys.stdout.flush()
     except BrokenPipeError:
-        # The reader of our output, such as `head`, has gone; Python would print another error as it ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except (KeyboardInterrupt, RuntimeError, MemoryError) as error:
         if isinstance(error, MemoryError) or re.search("allocate memory|out of memory", str(error)):
@@ -126,6 +124,10 @@ def guarded(action: Callable[[], object]) -> int:
         usage, failed = isinstance(error, errors.CouldNotRunError), isinstance(error, errors.AllFailedError)
         return _complain(error, USAGE if usage else ALL_FAILED if failed else FAILED)
     finally:
+        try:
+            sys.stdout.flush()
+        except OSError:  # its reader, such as `head`, has gone, or a disk is full: Python would print another error
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if ours:
             signal.signal(signal.SIGTERM, before)
     return 0

@@ -118,10 +118,10 @@ class Evaluate(shared.SimulationOptions):
             shared.print_metrics([*others, found.numbers()], str(self.data), details=self.details)
             if self.metrics:
                 sys.stdout.write(wosac_table(scored.record()))
-        if self.keep and not chosen:
-            keep_evaluation(agent.name, record)
         if self.figure is not None:
             render.draw_clips(clips, self.figure)
+        if self.keep and not chosen:  # last: the run may be another's, to read only
+            keep_evaluation(agent.name, record)
 
 
 class Table(shared.Command):

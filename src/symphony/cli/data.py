@@ -150,7 +150,7 @@ class Convert(shared.Command):
     #: Format of the logs: Waymo Open Motion Dataset (TFRecord), CommonRoad (XML), Argoverse 2 motion
     #: forecasting (Parquet, each with its map beside it), INTERACTION (CSV with Lanelet2 maps), ScenarioNet (pickle).
     format: Positional[Literal["womd", "commonroad", "argoverse2", "interaction", "scenarionet"]]
-    #: Files of that format, or folders to search for them (links in them are not followed).
+    #: Files of that format, or folders to search for them (links in them to folders are not followed).
     files: Annotated[Positional[shared.Paths], arg(metavar="FILE ...")]
     out: Path  # Folder of the store.
     rate: Positive = 5.0  # Steps per second in the store (the paper's 5).

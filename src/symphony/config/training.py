@@ -82,7 +82,7 @@ class PerturbConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class PreviewConfig(Settings):
-    """Settings of previews of an agent in training: animated rollouts, and distributions of what it does."""
+    """Settings of previews of an agent in training: animated rollouts."""
 
     #: Updates between previews, and one at the end of a run of that length (0: never); by default this takes about a
     #: hundredth of the time on a CPU, or less.

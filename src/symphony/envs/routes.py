@@ -238,11 +238,6 @@ class Routes(NamedTuple):
         begin = self.first[scene] + (scene * self.point.shape[1])[:, None, None]
         return FollowedRoutes(self.point.flatten(0, 1), begin, self.length[scene])
 
-    def beginnings(self) -> tuple[Float[Tensor, "B N G K 2"], Int[Tensor, "B N G"]]:
-        """Return the first :data:`POINTS` points of all routes, by which one is chosen, and which are real."""
-        every = self.among(torch.arange(len(self.point), device=self.first.device))
-        return every.points(POINTS), self.length.clamp_max(POINTS)
-
 
 class FollowedRoutes(NamedTuple):
     """Routes such as the one that each agent follows; leading dimensions [*b], such as [M, N]."""

@@ -26,7 +26,7 @@ from symphony.errors import ConfigError
 from symphony.imports import build_object, load_object
 from symphony.learning.demonstrations import SceneDataset
 from symphony.learning.experts import logged, logged_heights
-from symphony.metrics import Choice, RolloutMetrics, choices, collision_kinds, route_turns
+from symphony.metrics import RolloutMetrics, collision_kinds
 from symphony.roadgraph import visited_curvatures
 from symphony.rollouts.crowd import crowd_dataset
 from symphony.rollouts.driving import Simulation, simulate_batch
@@ -225,7 +225,6 @@ class _BatchEvaluator:
             kinds_logged=kinds_logged,
             curvature=self._curvatures(items, rollouts.state, exists & ~scenes.background[:, None, None]),
             curvature_log=logged_curvature,
-            choices=_choices(scenes, found),
         )
 
     def _curvatures(
@@ -237,21 +236,6 @@ class _BatchEvaluator:
             visited_curvatures(self.dataset.graph(item), path[b, ..., :2], path[b, ..., 2], there[b].numpy())
             for b, item in enumerate(items)
         ]
-
-
-def _choices(scenes: SceneBatch, found: Simulation) -> list[Choice] | None:
-    """Return how a search changed the choice of goals; None without search or without goals."""
-    if found.search is None or found.drawn is None or not scenes.route_point.shape[1]:
-        return None
-    # The rollouts of a tree are the first of its leaves.
-    each = found.goal.shape[1] // found.drawn.shape[1]
-    first = found.search.slots[..., 0, :each].sort(-1).values
-    founders = 1 + (first.diff(dim=-1) != 0).sum(-1)
-    turn = route_turns(*scenes.routes.beginnings())
-    # Goals of background agents are not chosen.
-    goals = found.drawn.flatten(1, 2), found.goal
-    drawn, goal = (torch.where(scenes.background[:, None], -1, each) for each in goals)
-    return choices(drawn.cpu(), goal.cpu(), turn.cpu(), founders.float().mean(-1).cpu())
 
 
 def _heights(scenes: SceneBatch, rollouts: Rollouts, *, as_logged: bool) -> tuple[Tensor, Tensor] | None:

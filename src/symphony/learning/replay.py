@@ -127,11 +127,6 @@ class SearchReplay:
         simulated[: self.states] = True
         return batch.set(keys.SIMULATED, simulated)
 
-    @property
-    def searched(self) -> bool:
-        """Whether there has been a search."""
-        return self._leaves is not None
-
     def repeatable(self, count: int, rng: torch.Generator) -> TensorDictBase:
         """Return first states [K] of survivors, with the random numbers of their histories (``noise_plan``)."""
         first = self.leaves[..., 0].flatten()

@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from symphony.metrics.choices import Choice, choice_numbers
 from symphony.metrics.intervals import ratio, summed, zero_bound
 from symphony.metrics.kinds import STANDING, CollisionKind, CollisionKinds
 
@@ -119,7 +118,6 @@ class SegmentResult:
     histogram: NDArray[np.int64]  # [201] curvatures of the branching regions visited by the rollouts
     histogram_log: NDArray[np.int64]  # [201] curvatures of those visited by the log
     speeds: NDArray[np.int64]  # [bins, 2] agent-steps by speed, simulated and logged
-    choice: Choice | None  # what the search made of the goals; None without search or goals
 
 
 class RolloutMetrics:
@@ -148,7 +146,6 @@ class RolloutMetrics:
         kinds_logged: CollisionKinds,
         curvature: Sequence[NDArray[Any]],
         curvature_log: Sequence[NDArray[Any]],
-        choices: Sequence[Choice] | None = None,
     ) -> None:
         """Add the rollouts of some segments, each seen once in all updates, else a ValueError is raised.
 
@@ -158,7 +155,7 @@ class RolloutMetrics:
         after a step, and whether its centre is off the road, which nobody is where the map has no boundary
         (``bounded``). Speeds are in m/s, ``last`` numbers the last step of each segment, ``kinds`` [B, K, N] are
         first collisions, those logged while their log exists. ``curvature`` is the average curvature of every
-        branching region that rollouts of a segment visit, and the log; ``choices`` what the search made of the goals.
+        branching region that rollouts of a segment visit, and the log.
         """
         # Sums are exact, so that padding among what is summed does not change how they are rounded.
         away = displacement.double().masked_fill(~(simulated & logged[:, None]), 0.0).flatten(2).tolist()
@@ -203,7 +200,6 @@ class RolloutMetrics:
                 histogram=curvature_histogram(curvature[b]),
                 histogram_log=curvature_histogram(curvature_log[b]),
                 speeds=np.stack([_speeds(driven[both]) for driven in (own, log)], -1),
-                choice=None if choices is None else choices[b],
             )
 
     def merge(self, other: RolloutMetrics) -> None:
@@ -216,16 +212,14 @@ class RolloutMetrics:
     def rows(self) -> list[dict[str, Any]]:
         """Return a row per segment, ordered by id, for paired comparisons; ``group`` is the recording it is part of.
 
-        Percentages (see :meth:`compute`), ``ade`` and ``min_sade`` in metres, and ``goals_variation`` where a search
-        had goals; NaN for a mean over nothing. ``ade_weight`` and so on: agent-steps, its weight in :meth:`compute`.
+        Percentages (see :meth:`compute`), ``ade`` and ``min_sade`` in metres; NaN for a mean over nothing.
+        ``ade_weight`` and so on: agent-steps, its weight in :meth:`compute`.
         """
         found = []
         for name, segment in sorted(self.segments.items()):
             own: dict[str, Any] = {key: _quotient(*segment.sums[key]) for key in _ROW}
             own |= {f"{key}_weight": segment.sums[key][1] for key in WEIGHTED}
-            choice = {} if segment.choice is None else {"goals_variation": segment.choice.variation}
-            about = {"segment": name, "group": segment.group, "ade": segment.ade}
-            found.append(about | own | choice)
+            found.append({"segment": name, "group": segment.group, "ade": segment.ade} | own)
         return found
 
     def mean(self, values: Mapping[str, float]) -> tuple[float, float]:
@@ -270,9 +264,8 @@ class RolloutMetrics:
             also as ``*_log``; ``agent_speed_distance``, how far the speeds are from the log's (Wasserstein, m/s).
 
             ``standing`` and ``standing_log`` are the percent of agents that stand at the last step, of those whose
-            log lasts that long; of goals see :func:`symphony.metrics.choices.choice_numbers`. ``segments``,
-            ``offroad_segments`` (those with a boundary, of which alone the off-road time is), ``groups`` and
-            ``rollouts`` (per segment) say how many there are.
+            log lasts that long. ``segments``, ``offroad_segments`` (those with a boundary, of which alone the
+            off-road time is), ``groups`` and ``rollouts`` (per segment) say how many there are.
         """
         found = [self.segments[name] for name in sorted(self.segments)]
         groups, member = np.unique([one.group for one in found], return_inverse=True)
@@ -287,8 +280,6 @@ class RolloutMetrics:
         out["curvature_jsd"], out["curvature_jsd_se"] = divergence.value, divergence.error
         out["curvature_jsd_floor"] = sampling_floor(np.stack([one.histogram_log for one in found]))
         out["curvature_jsd_corrected"] = divergence.corrected
-        chosen = [one.choice for one in found if one.choice is not None]
-        out |= choice_numbers(chosen) if chosen else {}
         speeds = np.sum([one.speeds for one in found], axis=0)
         share = np.cumsum(speeds / speeds.sum(0), axis=0) if speeds.any() else np.full((1, 2), math.nan)
         out["agent_speed_distance"] = float(WIDTH * np.abs(share[:, 0] - share[:, 1]).sum())

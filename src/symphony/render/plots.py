@@ -87,31 +87,20 @@ def plot_segment(
     return axes
 
 
-@dataclass
+@dataclass(frozen=True)
 class Clip:
-    """K rollouts of N agents of a run segment, to be drawn or animated; padding among the agents is left out."""
+    """K rollouts of N agents of a run segment, to be drawn or animated."""
 
     segment: RunSegment  # the log
     position: NDArray[Any]  # [K, N, T, 2] simulated box centres, metres
     heading: NDArray[Any]  # [K, N, T] radians
-    agents: Any  # [N] which agents of the segment these are; negative for padding
-    start: int = 0  # step of the log at which the rollouts begin
-    valid: Any = True  # [K, N, T] or [N, T]; steps that are not, or not finite, are left out
-    collision: Any = False  # [K, N, T], marked where each collision begins; by default none is known
-    offroad: Any = False  # [K, N, T], marked where each departure from the road begins
+    agents: NDArray[np.int64]  # [N] which agents of the segment these are
+    start: int  # step of the log at which the rollouts begin
+    valid: NDArray[np.bool_]  # [K, N, T]; other steps are left out
+    collision: NDArray[np.bool_]  # [K, N, T], marked where each collision begins
+    offroad: NDArray[np.bool_]  # [K, N, T], marked where each departure from the road begins
     view: View | None = None  # limits in metres; by default around rollouts and log of those agents
     title: str | None = None  # by default the segment's id
-
-    def __post_init__(self) -> None:
-        agents = np.asarray(self.agents, np.int64)
-        kept, shape = agents >= 0, self.heading.shape
-        self.agents = agents[kept]
-        self.position = np.asarray(self.position, np.float64)[:, kept]
-        self.heading = np.asarray(self.heading, np.float64)[:, kept]
-        self.valid, self.collision, self.offroad = (
-            np.broadcast_to(flags, shape)[:, kept] for flags in (self.valid, self.collision, self.offroad)
-        )
-        self.valid = self.valid & np.isfinite(self.position).all(-1) & np.isfinite(self.heading)
 
     @property
     def steps(self) -> slice:
@@ -156,7 +145,7 @@ class Clip:
 
 def saved_clip(saved: SavedRollouts, count: int | None = None, title: str | None = None) -> Clip:
     """Return the first ``count`` rollouts of a run segment, all by default, to be drawn or animated."""
-    state, valid = (part[:count].swapaxes(1, 2) for part in (saved.state, saved.there))
+    state, valid = saved.state[:count].swapaxes(1, 2).astype(np.float64), saved.there[:count].swapaxes(1, 2)
     judged = np.isin(np.arange(len(saved.agents)), saved.evaluated)
     flags = ((part & judged)[:count].swapaxes(1, 2) for part in (saved.collision, saved.offroad))
     collision, offroad = (np.pad(part, ((0, 0), (0, 0), (1, 0))) for part in flags)

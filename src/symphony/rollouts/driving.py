@@ -55,7 +55,6 @@ class Simulation(NamedTuple):
         at_states: [B, K, T, N] collisions at states only, as the paper and WOSAC count them.
         steps: simulated for them, each of a rollout or branch.
         failed: per scene, why the planner of a rollout failed, by its number; its later steps don't count.
-        drawn: [B, trees, S, N] goals of all branches that a search began with; None without one.
         meant: per scene, trajectories [K, P, T, H, 2] that its planners returned; None for none.
     """
 
@@ -65,7 +64,6 @@ class Simulation(NamedTuple):
     at_states: Bool[Tensor, "B K T N"]
     steps: int = 0
     failed: tuple[dict[int, str], ...] = ()
-    drawn: Int[Tensor, "B trees S N"] | None = None
     meant: tuple[Any, ...] = ()
 
 
@@ -137,9 +135,8 @@ def simulation(
         if module is not None:
             module.check()
     rollouts = Rollouts(*(_branches(part, made.order).flatten(1, 2) for part in made.rollouts))
-    drawn = None if made.tree is None else start.get(keys.GOAL)
     goal = _branches(made.goal, made.order).flatten(1, 2)
-    whole = Simulation(rollouts, goal, made.tree, rollouts.collision, made.steps, drawn=drawn)
+    whole = Simulation(rollouts, goal, made.tree, rollouts.collision, made.steps)
     if planned is None:
         return whole
     return _without_failed(whole, planned, _branches(made.ends.get(keys.PLANNER), made.order).flatten(1, 2))

@@ -110,6 +110,9 @@ class RolloutWriter(AbstractContextManager["RolloutWriter"]):
         if file.exists():
             held = _read_manifest(self.path)
             changed = [name for name in manifest if manifest[name] != held.get(name)]
+            if "store" in changed and isinstance(held.get("store"), dict):  # it may have been moved
+                changed.remove("store")
+                changed += ["store"] * (manifest["store"].get("checksum") != held["store"].get("checksum"))
             if "settings" in changed and isinstance(held.get("settings"), dict):
                 now, before = manifest["settings"], held["settings"]
                 changed.remove("settings")

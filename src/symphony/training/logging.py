@@ -12,8 +12,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
-from numpy.typing import NDArray
-
 from symphony.errors import ConfigError
 from symphony.files import naming, write_file
 
@@ -73,15 +71,13 @@ class Tracker:
         if self._run is not None:
             self._run.log(dict(values), step=step)
 
-    def preview(self, step: int, samples: Mapping[str, NDArray[Any]], video: Path) -> None:
-        """Give Weights & Biases, where it is used, histograms of samples [K] and an animation (gif)."""
+    def preview(self, step: int, video: Path) -> None:
+        """Give Weights & Biases, where it is used, an animation (gif)."""
         if self._run is None:
             return
         import wandb as tracking  # noqa: PLC0415 - is there by now
 
-        found: dict[str, Any] = {"preview/rollout": tracking.Video(str(video), format="gif")}
-        found |= {f"preview/{name}": tracking.Histogram(x.tolist()) for name, x in samples.items() if len(x)}
-        self._run.log(found, step=step)
+        self._run.log({"preview/rollout": tracking.Video(str(video), format="gif")}, step=step)
 
     def sync(self) -> None:
         """Put all records on the disk: a checkpoint must not survive a power cut that they don't."""

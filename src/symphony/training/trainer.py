@@ -283,7 +283,7 @@ class Trainer:
                 self.best, self.validated = self.validator.best, self.validator.what
             if self.previewer is not None and (last or step % config.preview.every == 0):
                 self._show("previewing")
-                numbers |= self.previewer(step, self.tracker)
+                self.previewer(step, self.tracker)
             self._show("training")
             began += time.perf_counter() - paused
             if numbers:

@@ -1,4 +1,4 @@
-"""The WOSAC score of an agent on any run segments, the passing order there, and the scores of baselines."""
+"""The WOSAC score of an agent on any run segments, and the scores of baselines."""
 
 from __future__ import annotations
 
@@ -11,21 +11,15 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-from jaxtyping import Float
-from numpy.typing import NDArray
-from torch import Tensor
 
 from symphony.agents import Agent, load_agent
 from symphony.config import WosacSettings
 from symphony.data.report import Skip
 from symphony.data.resample import resample
-from symphony.data.segment import TIMED, AgentType, RunSegment, SignalState
-from symphony.data.selection import relations
+from symphony.data.segment import TIMED, RunSegment, SignalState
 from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.evaluator import BASELINES
-from symphony.metrics import OrderStatistics, order_statistics, passing_gap
 from symphony.metrics.intervals import clustered_mean
 from symphony.rollouts.workers import shared
 from symphony.wosac.scorer import CHALLENGES, SimulatedRollouts, WosacConfig, WosacScenario, check_scored, score
@@ -110,63 +104,15 @@ def log_playback(window: RunSegment) -> SimulatedRollouts:
     return SimulatedRollouts(window.agent_id[rows], *np.moveaxis(np.repeat(states[None], ROLLOUTS, 0), -1, 0))
 
 
-EVERY = 2  # steps of 0.1 s between those at which paths are compared
-
-
-class PassingGaps(NamedTuple):
-    """The seconds by which the first of each of K pairs is ahead of the second, NaN where their paths don't meet."""
-
-    simulated: Float[Tensor, "R K"]
-    log: Float[Tensor, " K"]
-
-
-def passing_pairs(window: RunSegment) -> NDArray[np.int64]:
-    """Return [K, 2] rows of the vehicles that merge or cross in the log after the current step, both valid at it."""
-    now = window.current_step
-    future = window.during(slice(now, None, EVERY), dt=window.dt * EVERY, current_step=0)
-    rows = np.flatnonzero(window.valid[:, now] & (window.agent_type == AgentType.VEHICLE))
-    pairs = []
-    for k, row in enumerate(rows[:-1]):
-        others = rows[k + 1 :]
-        found = relations(future.replace(ego=int(row)), others)
-        pairs += [(row, other) for other in others[np.minimum(found.merge, found.crossing) < np.inf]]
-    return np.array(pairs, np.int64).reshape(-1, 2)
-
-
-def passing_gaps(window: RunSegment, pairs: NDArray[np.int64], rollouts: SimulatedRollouts) -> PassingGaps:
-    """Return gaps of K pairs of rows [K, 2] (see :func:`passing_pairs`) in rollouts of all agents and in the log."""
-    column = {int(name): k for k, name in enumerate(rollouts.object_id)}
-    simulated, log = [torch.zeros(len(rollouts.x), 0)], [torch.zeros(0)]
-    for pair in pairs:
-        # Steps 12, 14, …: of rollouts, which begin with step 11, every other one.
-        columns = [column[int(window.agent_id[row])] for row in pair]
-        states = np.stack([rollouts.x, rollouts.y], -1)[:, columns, EVERY - 1 :: EVERY] - window.origin[:2]
-        first, second = torch.from_numpy(states).unbind(1)
-        always = torch.ones(first.shape[:-1], dtype=torch.bool)
-        dt = window.dt * EVERY
-        simulated.append(passing_gap(first, second, always, always, dt)[:, None])
-        future = slice(window.current_step + EVERY, None, EVERY)
-        place = torch.from_numpy(window.position[pair][:, future, :2].astype(np.float64))
-        valid = torch.from_numpy(window.valid[pair][:, future])
-        log.append(passing_gap(place[0], place[1], valid[0], valid[1], dt)[None])
-    return PassingGaps(torch.cat(simulated, -1), torch.cat(log))
-
-
-def order_of(found: Sequence[PassingGaps]) -> OrderStatistics:
-    """Return the order statistics of all pairs of all run segments together."""
-    return order_statistics(torch.cat([one[0] for one in found], -1), torch.cat([one[1] for one in found]))
-
-
 WOSAC_BASELINES = (*BASELINES, "idm", "random")
 """Baselines scored beside every agent: log playback, constant velocity, the intelligent driver model along the lanes,
 and vehicles that act at random."""
 
 
 class SegmentResult(NamedTuple):
-    """An agent on a run segment: its scores (:func:`.scorer.score`), passing gaps and CPU seconds of simulation."""
+    """An agent on a run segment: its scores (:func:`.scorer.score`) and CPU seconds of simulation."""
 
     scores: dict[str, float]
-    passing: PassingGaps
     seconds: float
 
 
@@ -201,10 +147,8 @@ class WosacEvaluation:
         """Return the record in types that JSON can hold."""
         agents = {}
         for name, found in self.results.items():
-            order = dataclasses.asdict(order_of([one.passing for one in found]))
             agents[name] = {
                 **self.flat(name),
-                "order": {key: None if math.isnan(value) else value for key, value in order.items()},
                 "seconds": sum(one.seconds for one in found),
                 "segments": {segment: one.scores for segment, one in zip(self.segments, found, strict=True)},
             }
@@ -362,14 +306,12 @@ class _SegmentScorer:
             if self.strict:
                 raise
             return Skip.of(error, segment.file, segment.segment_id)
-        pairs = passing_pairs(window)
         found = {}
         for agent in self.agents:
             began = time.process_time()
             made = self._made(agent, window)
             seconds = time.process_time() - began
-            scores = score(scenario, made, CHALLENGES[self.config])
-            found[agent.name] = SegmentResult(scores, passing_gaps(window, pairs, made), seconds)
+            found[agent.name] = SegmentResult(score(scenario, made, CHALLENGES[self.config]), seconds)
         return _Scored(segment.group or segment.segment_id, len(scenario.evaluated), found)
 
     def _made(self, agent: Agent, window: RunSegment) -> SimulatedRollouts:

@@ -37,11 +37,8 @@ def wosac_table(record: dict[str, Any]) -> str:
     name, found = record["agent"], record["agents"]
     rows = [(_WORDS[other], numbers) for other, numbers in found.items() if other in _WORDS and other != name]
     rows.append((f"{name}, {how_in_words(record['how'])}", found[name]))
-    lines = [["", *(column.title for column in COLUMNS), "order kept %"], ["---"] * (len(COLUMNS) + 2)]
-    for row, numbers in rows:
-        kept = numbers["order"]["kept"]
-        cells = [_cell(numbers, column) for column in COLUMNS]
-        lines.append([row, *cells, "–" if kept is None else f"{100 * kept:.0f}"])
+    lines = [["", *(column.title for column in COLUMNS)], ["---"] * (len(COLUMNS) + 1)]
+    lines += [[row, *(_cell(numbers, column) for column in COLUMNS)] for row, numbers in rows]
     table = "".join(f"| {' | '.join(line)} |\n" for line in lines)
     return f"{table}\n{_note(record)}.\n"
 
@@ -66,8 +63,7 @@ def _note(record: dict[str, Any]) -> str:
     return (
         f"WOSAC {record['config']}{short}: {len(numbers['segments'])} run segments of {record['recordings']} "
         f"recordings{objects} in {record['data']['name']} ({record['data']['checksum'][:12]}){rates}, 32 rollouts "
-        f"each; ± standard error over recordings; order of {numbers['order']['pairs']} pairs that merge or cross in "
-        "the log"
+        "each; ± standard error over recordings"
     )
 
 

@@ -1,4 +1,4 @@
-"""The share of sampling in a divergence, and the effect of a search on goals."""
+"""The share of sampling in a divergence."""
 
 from __future__ import annotations
 
@@ -8,13 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
-from symphony.geometry import rotate
-from symphony.metrics import Choice, choices, jensen_shannon, route_turns, sampled_divergence, sampling_floor
-from symphony.metrics.choices import choice_numbers
+from symphony.metrics import jensen_shannon, sampled_divergence, sampling_floor
 
 BINS = 15
 
@@ -77,49 +72,3 @@ def test_the_floor_is_what_a_log_scores_against_what_it_was_drawn_from(segments:
     trials = [perfect(segments, 1600, rng) for _ in range(20)]
     scored = np.mean([sampled_divergence(policy, log).value for policy, log in trials])
     assert scored < np.mean([sampling_floor(log) for _, log in trials])
-
-
-def arc(angle: float, points: int = 30) -> torch.Tensor:
-    """A route that is straight, then turns by an angle to the left, then goes on."""
-    heading = torch.zeros(points, dtype=torch.float64)
-    heading[10:15] = torch.linspace(0, angle, 5, dtype=torch.float64)
-    heading[15:] = angle
-    return torch.stack([heading.cos(), heading.sin()], -1).cumsum(0) * 3.0
-
-
-@given(st.floats(-3.0, 3.0), st.floats(-2.6, 2.6), st.floats(-500, 500))
-def test_turns_do_not_depend_on_where_a_route_lies(turn: float, angle: float, shift: float) -> None:
-    if abs(abs(angle) - math.radians(45)) < 1e-3:
-        return
-    routes = torch.stack([arc(angle), arc(-angle)])
-    moved = rotate(routes, torch.tensor(turn, dtype=torch.float64)) + shift
-    count = torch.tensor([30, 30])
-    wanted = 0 if abs(angle) < math.radians(45) else int(np.sign(angle))
-    assert (route_turns(routes, count) - 1).tolist() == [wanted, -wanted]
-    assert (route_turns(moved, count) - 1).tolist() == [wanted, -wanted]
-    both = route_turns(torch.stack([routes, routes.flip(0)]).expand(3, 2, 2, -1, -1), count.expand(3, 2, 2))
-    assert (both - 1).tolist() == 3 * [[[wanted, -wanted], [-wanted, wanted]]]
-    # What lies past the end of a route is no part of it.
-    assert route_turns(routes, torch.tensor([9, 9])).tolist() == [1, 1]
-    assert route_turns(routes[:, :2], torch.tensor([2, 2])).tolist() == [1, 1]
-
-
-def test_by_hand() -> None:
-    drawn = torch.tensor([[[0, -1], [0, -1], [1, -1], [2, -1]]])
-    kept, turn = torch.tensor([[[0, -1], [0, -1]]]), torch.tensor([[[2, 1, 0], [1, 1, 1]]])
-    (one,) = choices(drawn, kept, turn, torch.tensor([2.0]))
-    assert (one.drawn.tolist(), one.kept.tolist(), one.variation) == ([1, 1, 2], [0, 0, 2], 0.5)
-    numbers = choice_numbers([one])
-    assert (numbers["goals_drawn_left"], numbers["goals_kept_left"]) == (50, 100)
-    assert (numbers["goals_turn_variation"], numbers["goals_founders"]) == (0.5, 2)
-    nothing = choice_numbers([Choice(np.zeros(3, int), np.zeros(3, int), math.nan, 1.0)])
-    assert math.isnan(nothing["goals_variation"])
-
-
-@given(st.permutations(range(6)), st.integers(0, 2**31))
-def test_a_search_that_keeps_all_moves_no_goal(order: list[int], seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    drawn = torch.tensor(rng.integers(0, 4, (1, 6, 2)))
-    turn = torch.tensor(rng.integers(0, 3, (1, 2, 4)))
-    (one,) = choices(drawn, drawn[:, list(order)], turn, torch.tensor([6.0]))
-    assert (one.variation, one.drawn.tolist()) == (0, one.kept.tolist())
