@@ -119,9 +119,9 @@ def _preset(counts: tuple[int, int, int], *checksums: str) -> Preset:
 PRESETS: dict[str, Preset] = {
     "town-small": _preset(
         (2_000, 200, 500),
-        "a0e36f57eb51a7f5f32f2515034d9f37d2dd783aa3821c6e6c536c4636e97acd",
+        "fc678848f95ed70b36191f6ae5ba8ac51747df4da5e2ee38f396f8ad8e87ae98",
         "33383d075ad99ffe68dffc191d76512f80ce9490d0cc4e503b5edf2c2a671ce0",
-        "6cba2b0806d3b801b4601b1718ae4852f1d05a151dee28baa21b2faebee936ee",
+        "2a5b2abe4e4463a6b4b4efe18a799c30d9c1844ee58fa5e7528d9e57ff5b31ba",
     ),
     "town": _preset(
         (10_000, 200, 1_000),
