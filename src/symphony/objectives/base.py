@@ -184,8 +184,10 @@ class ActorLoss(MaskedLoss):
         # A padded entry may hold anything, such as an invalid index, and 0 may lie outside the support.
         fitted = counted.reshape(counted.shape + (1,) * (action.ndim - counted.ndim))
         if counted.numel():
-            one = action.reshape(counted.numel(), *action.shape[counted.ndim :])[counted.flatten().int().argmax()]
-            action = torch.where(fitted, action, torch.where(counted.any(), one, 0))
+            one = action.reshape(counted.numel(), *action.shape[counted.ndim :])[
+                counted.flatten().int().argmax(0, keepdim=True)
+            ]
+            action = torch.where(fitted, action, torch.where(counted.any(), one.squeeze(0), 0))
         cost = -dist.log_prob(action)
         if not isinstance(dist, Categorical):
             return Fit(cost, counted, None, None)
