@@ -20,7 +20,10 @@ from symphony.agents.checkpoint import checkpoints, parts_of
 from symphony.agents.choice import choose
 from symphony.cli import main
 from symphony.config import AgentSpec, EvaluateConfig, MGAILConfig, ValidationConfig, to_json
+from symphony.data.builtin import builtin_store
+from symphony.data.store import SegmentStore
 from symphony.errors import ConfigError
+from symphony.evaluation import evaluate
 from symphony.recipes import train
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -138,3 +141,12 @@ def test_shipped(name):
         assert "optimizer" not in place
         assert b"/work" not in content, place
         assert b"/tmp" not in content, place
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_what_is_shipped_does_not_take_unknown_speed_limits_for_slow_roads(name, tmp_path):
+    known, config = SegmentStore(builtin_store("test")), EvaluateConfig(rollouts=2, search="none")
+    stores = known, load_script("hide_limits").hide(known, tmp_path / "hidden", 1.0)
+    found = (evaluate(load_agent(f"pretrained:{name}"), one, config, items=range(8)).numbers() for one in stores)
+    fast, unknown = (numbers["agent_speed"] for numbers in found)
+    assert unknown == pytest.approx(fast, rel=0.2)
