@@ -125,9 +125,9 @@ PRESETS: dict[str, Preset] = {
     ),
     "town": _preset(
         (10_000, 200, 1_000),
-        "733d55e15f2a3342cd864f9936f9a9205027efbc4118f8b855091de22f0c2db1",
+        "9906f2832c2e670f91cff1f618e9031f54e5913095b225dc7d309fa73d4a22f0",
         "33383d075ad99ffe68dffc191d76512f80ce9490d0cc4e503b5edf2c2a671ce0",
-        "9285526cbca60e634bd62aaec2cba1ebdb7c812c2cacd7bc87e0231a5bcc66fd",
+        "6f32affb6a206b2a9c858ead75a8fd4aa2a37a63d85fe5168ed2a347d013e782",
     ),
 }
 """The standard sets: towns with signals, all kinds of unsignalled control and roundabouts, 10 s, N_I = 2."""
