@@ -90,7 +90,7 @@ format: $(DEV)  ## rewrite the files in the style that lint asks for
 
 clean:  ## remove .venv, caches and everything written by the targets above
 	rm -rf $(VENV) $(VENV)-lowest out build dist src/*.egg-info
-	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find src tests recipes benchmarks -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
 
 $(CORE): pyproject.toml $(CONSTRAINTS)

@@ -97,7 +97,8 @@ def test_installed_command_prints_whatever_the_terminal_can_show(store: Path) ->
     assert subprocess.run([command, "--version"], check=True, **how).stdout == f"symphony {__version__}\n"
     assert r"\u2013" in subprocess.run([command, "data", "info", str(store)], check=True, **how).stdout
     assert subprocess.run(f"{command} --version >&- 2>&-", shell=True, check=True)  # noqa: S602 - our own words
-    full = subprocess.run(f"{command} --version >/dev/full", shell=True, check=False, stderr=-1)  # noqa: S602
+    words = f"env -u PYTHONUNBUFFERED {command} --version >/dev/full"
+    full = subprocess.run(words, shell=True, check=False, stderr=-1)  # noqa: S602
     assert (full.returncode, full.stderr) == (1, b"symphony: error: No space left on device\n")
 
 

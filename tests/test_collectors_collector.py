@@ -93,6 +93,7 @@ def test_reloading():
 @pytest.mark.parametrize("options", [
     {}, {"compact_obs": True}, {"keep": [("next", *X), ACTION]}, {"set_truncated": True},
     {"postproc": lambda td: td.select("next", "action", strict=False)},
+    {"postproc": lambda td: td.select(("next", "done"), ("next", *X)), "set_truncated": True},
 ])  # fmt: skip
 def test_fake_batch_looks_like_a_real_one(options, leaves):
     collector = make(leaves=leaves, frames_per_batch=FRAMES * (leaves or 1), **options)

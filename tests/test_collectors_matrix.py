@@ -272,14 +272,15 @@ def test_agents_of_a_group_are_planned_for():
     assert planned["planner", "action"].shape == (ROWS, 3, BRANCHES, 2, 1)
 
 
-def test_a_policy_that_remembers_proposes_and_remembers_what_is_made():
+@pytest.mark.parametrize("key", [("next", "memory"), "memory"])
+def test_a_policy_that_remembers_proposes_and_remembers_what_is_made(key):
     """With one branch it drives as alone."""
 
     def remembering(memory: Tensor, observation: Tensor) -> tuple[Tensor, Tensor]:
         action = (memory + observation.sum(-1, keepdim=True)).sin()
         return action, memory + action + 1
 
-    policy = TensorDictModule(remembering, ["memory", "observation"], ["action", ("next", "memory")])
+    policy = TensorDictModule(remembering, ["memory", "observation"], ["action", key])
     primer = envs.TensorDictPrimer(memory=Unbounded((1,)), expand_specs=True)
     env = envs.TransformedEnv(with_rows(Mass(limit=99.0), [ROWS]), primer)
     start, planner = env.reset(), BeamSearchPlanner(env, 3, 1, policy=policy)

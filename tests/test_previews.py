@@ -24,7 +24,6 @@ from symphony.recipes import train
 from symphony.render import Clip, animate_rollouts
 from symphony.training.logging import Tracker, read_metrics
 
-MOTIONS = ("speed", "acceleration", "turn")
 store = stored(lambda: [straight_road(4, steps=6), crossing(4, steps=5), crossing(5, seed=1, steps=6)])
 held_out = stored(lambda: [crossing(6, seed=seed, steps=5) for seed in range(10, 14)])
 

@@ -181,7 +181,7 @@ class BeamSearchCollector(Collector):
         last = (torch.arange(leaves.shape[-1]) == leaves.shape[-1] - 1).expand(leaves.shape)
         for key in self._done if self.set_truncated else ():
             if last_name(key) == "truncated":
-                for name in (key, (*key[:-1], "done")):
+                for name in {key, (*key[:-1], "done")} & {*leaves.keys(True, True)}:
                     ended = leaves.get(name)
                     leaves.set(name, ended | expand_as_right(last, ended).to(ended.device))
         return leaves

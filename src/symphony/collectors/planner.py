@@ -66,7 +66,8 @@ class BeamSearchPlanner(MPCPlannerBase):
         """Return the first action of the best branch from states [*b]; the targets are written into them."""
         root = tensordict.exclude("planner", "next", *self.env.action_keys)
         start, periods = branch(root, self.branches), -(-self.planning_horizon // self.prune_every)
-        memory = [key for key in getattr(self.policy, "out_keys", ()) if key[0] == "next"]
+        given, made = (getattr(self.policy, name, ()) for name in ("in_keys", "out_keys"))
+        memory = [key for key in made if key[0] == "next" or key in given]
         found = beam_search(
             self.env,
             self.policy or branched_env(self.env, start.shape).rand_action,

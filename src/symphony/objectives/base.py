@@ -181,12 +181,12 @@ class ActorLoss(MaskedLoss):
             raise ValueError(
                 f"action {self.tensor_keys.action!r} has shape {tuple(action.shape)}, the actor's are {expected}"
             )
-        # A padded entry may hold anything, such as an invalid index, and 0 may lie outside the support.
+        # A padded entry may hold anything, such as an invalid index, and 0 may lie outside the support: an action
+        # that counts, if any does, stands in for it.
         fitted = counted.reshape(counted.shape + (1,) * (action.ndim - counted.ndim))
         if counted.numel():
-            one = action.reshape(counted.numel(), *action.shape[counted.ndim :])[
-                counted.flatten().int().argmax(0, keepdim=True)
-            ]
+            flat = action.reshape(counted.numel(), *action.shape[counted.ndim :])
+            one = flat[counted.flatten().int().argmax(0, keepdim=True)]
             action = torch.where(fitted, action, torch.where(counted.any(), one.squeeze(0), 0))
         cost = -dist.log_prob(action)
         if not isinstance(dist, Categorical):

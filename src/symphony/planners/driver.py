@@ -364,5 +364,5 @@ def _words(error: Exception) -> str:
     """Return an exception on one line, with the place that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
-    said = traceback.format_exception_only(error)[-1].partition(": ")[2]  # also of one that can't say what it is
+    said = str(traceback.TracebackException.from_exception(error))  # also of one that can't say what it is
     return f"{type(error).__name__}: {' '.join(said.split())[:200]}{place}"
