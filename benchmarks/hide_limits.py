@@ -6,7 +6,7 @@ copies among simulated segments they learn to tell the speed of a road from its 
 
 from __future__ import annotations
 
-import sys
+import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,6 +31,18 @@ def hide(store: SegmentStore, out: Path, share: float, seed: int = 0) -> Segment
     return SegmentStore(out)
 
 
-if __name__ == "__main__":
-    found = hide(SegmentStore(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3]))
+def main() -> None:
+    """Write the copies and say how many there are."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("store", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("share", type=float, help="above 0, at most 1")
+    given = parser.parse_args()
+    if not 0 < given.share <= 1:
+        parser.error(f"a share is above 0 and at most 1, not {given.share}")
+    found = hide(SegmentStore(given.store), given.out, given.share)
     print(f"{len(found)} segments in {found.path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -141,8 +141,11 @@ def test_progress_is_along_the_route_and_relative_to_the_log(lines: list[Any]) -
     ways.state[0, 6:, 0, :2] = ways.state[0, :5, 0, :2]
     row = rows(ways)[0]
     assert (row["progress"], row["progress_ratio"]) == pytest.approx((16, 0.4), abs=1e-4)
-    ways.counted[0] = False  # one that never comes is no agent that stands
-    assert rows(ways)[0]["progress"] is None
+    both = played(driving((0, 0, 0, 10), (50, 0, 0, 10), steps=11), [0, 1])
+    both.counted[0, :, 1] = False  # one that never comes is no agent that stands
+    assert rows(both)[0]["progress"] == pytest.approx(20, abs=1e-4)
+    both.counted[:] = False
+    assert rows(both)[0]["progress"] is None
 
 
 def red(states: Any = SignalState.STOP, others: Any = SignalState.GO, aside: float = 0) -> list[tuple[int, int]]:

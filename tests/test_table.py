@@ -162,6 +162,10 @@ def test_evaluate_keeps_what_it_found_and_table_and_figure_find_it(tmp_path, mon
     with Image.open(drawn) as film:
         assert film.n_frames == 5
     assert not (run / "evaluations").exists()
+    (run / "evaluations").write_text("")  # in the way: numbers and figure are not lost for it
+    drawn.unlink()
+    assert (main([*command, "--figure", str(drawn)]), drawn.exists()) == (1, True)
+    (run / "evaluations").unlink()
     for _ in range(2):
         assert main(command) == 0
     ((name, record),) = kept_evaluations(run).items()
