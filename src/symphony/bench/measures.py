@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symphony.evaluation.planners import run_score
-from symphony.metrics.intervals import beta_quantile, grouped_mean, t_quantile
+from symphony.metrics.intervals import beta_quantile, effective_groups, grouped_mean, t_quantile
 
 Run = dict[str, Any]
 _ALIKE = 1e-9  # standard error below which groups do not differ but by rounding
@@ -107,7 +107,7 @@ def estimate(
         return Estimate(mean, 100.0 * (1 - low), 100.0 * high, len(value), count)
     if error is None or (error < _ALIKE and kind == "mean"):
         return Estimate(mean, None, None, len(value), count)
-    spread = t_quantile(confidence, len(value) ** 2 / int((np.bincount(number) ** 2).sum()) - 1) * error
+    spread = t_quantile(confidence, effective_groups(number) - 1) * error
     if kind == "difference":
         spread = max(spread, 100.0 * beta_quantile(confidence, 1, count))
     return Estimate(mean, mean - spread, mean + spread, len(value), count)

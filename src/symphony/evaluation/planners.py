@@ -12,7 +12,7 @@ import numpy as np
 from symphony.errors import ConfigError, DataError
 from symphony.evaluation.report import report, total_numbers
 from symphony.evaluation.table import markdown
-from symphony.metrics.intervals import grouped_mean, t_quantile
+from symphony.metrics.intervals import effective_groups, grouped_mean, t_quantile
 from symphony.saved.folder import RolloutFolder
 from symphony.saved.rollouts import PLAYBACK
 
@@ -184,5 +184,4 @@ def paired_difference(one: Record, other: Record) -> tuple[float | None, float |
     group = {run["segment"]: run["group"] or run["segment"] for run in one["per_run"]}
     apart = {k: a - b for k, a in mine.items() if a is not None and (b := theirs.get(k)) is not None}
     _, member = np.unique([group[segment] for segment in apart], return_inverse=True)
-    effective = len(member) ** 2 / max((np.bincount(member) ** 2).sum(), 1)
-    return *grouped_mean(np.array(list(apart.values())), np.ones(len(apart)), member), float(effective)
+    return *grouped_mean(np.array(list(apart.values())), np.ones(len(apart)), member), effective_groups(member)

@@ -52,6 +52,11 @@ def clustered_mean(values: NDArray[np.float64], member: NDArray[np.int64]) -> tu
     return ratio(values[known], np.ones(known.sum()), member[known])
 
 
+def effective_groups(member: NDArray[np.int64]) -> float:
+    """Return how many groups of equal size scatter as much as these, given each segment's group; 0 without any."""
+    return len(member) ** 2 / max(int((np.bincount(member) ** 2).sum()), 1)
+
+
 def zero_bound(of: int) -> float:
     """Return the percent, about 300 / n, that a rate has at most, with 95 % confidence, if n samples show nothing.
     Source: Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26 (1934).
