@@ -198,6 +198,8 @@ def test_maps_without_a_part(name: str, tmp_path: Path) -> None:
         path = written_with(tmp_path, (name,), value)
         error = read_error("argoverse2", path)
         assert (error.file, error.segment, error.field) == (argoverse2.map_path(path), NAME, name)
+    error = read_error("argoverse2", written_with(tmp_path, (*LANE, "id"), 20))
+    assert "lane_segments 20: two of one id" in str(error)
 
 
 @pytest.mark.parametrize(("keys", "value", "kind"), [

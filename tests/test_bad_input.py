@@ -175,6 +175,8 @@ def test_commonroad_odd_things(old: str, new: str, kind: str, example: str, tmp_
     assert report.odd[kind] == 1
     with pytest.raises(DataError, match="field strict"):
         convert("commonroad", [path], tmp_path / "strict", interactive=1, strict=True)
+    path.write_text(whole.replace(light, light + light.replace("red", "green")))
+    assert "trafficLight 30: two of one id" in str(sources.read_error("commonroad", path))
 
 
 def test_many_parked_cars_one_late_state_and_files_beyond_all_measure(tmp_path, monkeypatch):

@@ -226,8 +226,11 @@ def line(axis: int, across: float, height: float, back: bool = False) -> NDArray
     return points
 
 
-def overpass(height: float = HIGH, slope: float = 0.0, turn: float = 0.0) -> RunSegment:
-    """A road along x, and one along y at a height; a car on each is at the crossing at 4 s. All climbs along x."""
+def overpass(height: float = HIGH, slope: float = 0.0, turn: float = 0.0, ramp: float = 0.0) -> RunSegment:
+    """A road along x, and one along y at a height; a car on each is at the crossing at 4 s.
+
+    All climbs along x, and the bridge ends in ramps.
+    """
     half, lanes = LANE_WIDTH / 2, [line(0, 0, 0), line(1, 0, height)]
     boundary = [
         line(0, -half, 0), line(0, half, 0, back=True), line(1, half, height), line(1, -half, height, back=True),
@@ -244,7 +247,7 @@ def overpass(height: float = HIGH, slope: float = 0.0, turn: float = 0.0) -> Run
     def lifted(points: NDArray[Any]) -> NDArray[Any]:
         c, s = np.cos(turn), np.sin(turn)
         x, y, z = np.moveaxis(points, -1, 0)
-        return np.stack([c * x - s * y, s * x + c * y, z + slope * x], -1)
+        return np.stack([c * x - s * y, s * x + c * y, z + slope * x - ramp * (abs(y) - 20).clip(0)], -1)
 
     road = make_road([lifted(each) for each in lanes], boundary=[lifted(each) for each in boundary])
     made = make_segment(
@@ -308,9 +311,10 @@ def test_at_one_height_all_of_it_counts() -> None:
 
 
 @pytest.mark.parametrize("agent", ["playback", "constant_velocity"])
-def test_an_evaluation_holds_to_it(agent: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("ramp", [0.0, 0.07])
+def test_an_evaluation_holds_to_it(agent: str, ramp: float, tmp_path: Path) -> None:
     """Of two segments, one with a bridge, half collide, and none are off the road but where both roads are one."""
-    fill(tmp_path / "store", [overpass(0.0), overpass(HIGH)])
+    fill(tmp_path / "store", [overpass(0.0), overpass(HIGH, ramp=ramp)])
     how = EvaluateConfig(rollouts=2)
     rates = [evaluate(agent, tmp_path / "store", how, items=items).numbers() for items in ([0], [1], [0, 1])]
     for name in ("collision_rate", "collision_rate_at_states", "collision_crossing"):

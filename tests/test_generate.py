@@ -483,8 +483,8 @@ def test_lanes_lie_where_opendrive_has_them(tmp_path: Path) -> None:
 
 @needs_sumo
 @pytest.mark.parametrize(("limit", "speeds"), [
-    ('max="no limit"', {50}), ('max="undefined"', {50}), ('max="30" unit="mph"', {48}),
-    ('max="80"/></type><type s="60"><speed max="30" unit="mph"/></type><type s="200"><speed max="25"', {288, 48, 90}),
+    ('max="no limit"', {130}), ('max="undefined"', {50}), ('max="30" unit="mph"', {48}),
+    ('max="80"/></type><type s="60"><speed max="no limit"/></type><type s="190"><speed max="25"', {288, 130, 90}),
 ])  # fmt: skip
 def test_a_straight_road_is_seen_from_its_middle_whatever_its_limit_says(
     tmp_path: Path, limit: str, speeds: set[int]

@@ -111,6 +111,8 @@ def test_cases_of_the_newer_layout(tmp_path: Path) -> None:
         assert (segment.predict.tolist(), segment.interest.tolist()) == ([1], [0])
         assert segment.agent_type[0] == AgentType.PEDESTRIAN
         np.testing.assert_allclose(segment.position[1, 0] + segment.origin, (x + 1, 2, 0), atol=1e-4)
+    late = [row for row in rows if row[0] == "1" or int(row.split(",")[2]) > 5]
+    assert [s.current_step for s in segments(cases(tmp_path / "train", "DR_Y", late))] == [9, 5]
 
 
 def test_recordings_beside_their_own_maps_differ_by_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,6 +188,10 @@ def test_states_logged_twice(tmp_path: Path) -> None:
     assert "track 3 has two states at 700 ms" in error.message
     found = read_one("interaction", path, motion="positions")
     np.testing.assert_allclose(found.position[0, 7, :2] + found.origin[:2], (7.1, 2.05), atol=1e-4)
+    for old, new in (("7.0000,2.0000", "17.0000,2.0000"), ("car", "pedestrian/bicycle")):
+        path = public(tmp_path, [*CARS, track(3)[7].replace(old, new)])
+        error = read_error("interaction", path, motion="positions")
+        assert "track [3] has states at one time that are far apart or of two types" in error.message
 
 
 GOOD = text(CARS)

@@ -148,6 +148,9 @@ BROKEN = {
     osm().replace("x='50'", "x='inf'", 1): "not finite", osm().replace("x='50'", "", 1): "is not a number",
     osm("degrees").replace("lat='49.", "lat='89.", 1): "outside latitudes",
     osm().replace("<relation id='102'", "<relation id='101'"): "two lanelets of one id",
+    osm().replace("<node id='2'", "<node id='1'"): "node: two of one id",
+    osm().replace("<way id='22'", "<way id='21'"): "way 21: two of one id",
+    osm(rules={202: ({}, {}), 203: ({}, {})}).replace("id='203'", "id='202'"): "regulatory_element: two of one id",
 }  # fmt: skip
 
 

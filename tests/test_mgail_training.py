@@ -21,7 +21,7 @@ from symphony.config import EvaluateConfig, MGAILConfig, TrainConfig
 from symphony.data.segment import RunSegment
 from symphony.data.store import SegmentStore
 from symphony.envs import Displacement
-from symphony.errors import SymphonyError
+from symphony.errors import ConfigError
 from symphony.evaluation import evaluate
 from symphony.learning.demonstrations import SceneDataset
 from symphony.recipes import train
@@ -185,8 +185,10 @@ def test_adversarial_training_starts_from_a_regression(store: Path, tmp_path: Pa
     for name, value in after.items():
         assert torch.equal(value, fresh[name]) == name.startswith("policy.") or value.numel() < 2
     bicycle = train(tiny("bc", store, tmp_path / "bc", steps=1))
-    with pytest.raises(SymphonyError):
-        train(config("mgail", store, tmp_path / "other", warm_start=bicycle))
+    for cells in (0, 7):  # with as many outputs as a bicycle's 7 x 7 actions the weights alone would fit
+        other = config("mgail", store, tmp_path / "other", warm_start=bicycle)
+        with pytest.raises(ConfigError, match="another action_space: bicycle, not displacement"):
+            train(replace(other, agent=replace(other.agent, cells=cells)))
 
 
 def test_the_duration_cuts_segments(seconds: Path, tmp_path: Path) -> None:

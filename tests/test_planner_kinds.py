@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
+import os
 import re
 import shutil
+import signal
 import sys
 import time
 from functools import partial
@@ -189,6 +192,28 @@ def test_one_that_takes_too_long_fails_its_run(store: Path, tmp_path: Path, how:
         late = f"step 3: TimeoutError: took more than 0.5 s ({Path(__file__).name}:"
         assert saved.failed[0].startswith(late)
         assert saved.counted[0].sum() == 3
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_ends_the_command_is_not_the_planners_to_catch(
+    store: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    def careful(observation: Observation) -> tuple[float, float]:
+        with contextlib.suppress(BaseException):
+            os.kill(os.getpid(), number)
+            time.sleep(60)
+        return -5.0, 0.0
+
+    def ended(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(number, ended)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            alone(store, tmp_path / "sim", careful)
+        assert signal.getsignal(number) is ended
+    finally:
+        signal.signal(number, before)
 
 
 def test_of_a_trajectory_the_first_state_is_driven() -> None:

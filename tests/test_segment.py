@@ -181,6 +181,7 @@ def test_odd_values_are_named() -> None:
     small = segment.replace(size=segment.size * np.float32(0.1))
     jumping = segment.replace(position=moved(segment.position, 100))
     slow = segment.replace(velocity=segment.velocity * np.float32(0.28))
+    swapped = segment.replace(velocity=segment.velocity[..., ::-1].copy())
     kinds = (fast, "faster"), (small, "under 0.2 m"), (jumping, "jumps"), (slow, "velocities"), (away, "away")
-    for odd, word in kinds:
+    for odd, word in (*kinds, (swapped, "velocities")):
         assert word in oddities(validate(odd))[0]

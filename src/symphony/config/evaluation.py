@@ -60,7 +60,7 @@ class SimulationConfig(Settings):
     search: Search = "agent"
     #: Score that a search keeps low. `agent`: the one that suits the agent best (the discriminator, unless its card
     #: names another); `discriminator`: how simulated a state looks to the agent's discriminator; `flags`: collisions
-    #: and time off the road; `rule`: these, and collisions within half a second if all keep speed and course.
+    #: and time off the road; `rule`: these, and collisions half a second later if all keep speed and course.
     score: ScoreName = "agent"
     branches: Natural = 0  # Branches of each tree; 0: as many as the agent's `search.test-branches`.
     #: Rule that prunes trees. `agent`: the one of the agent's training; `symphony train --help` explains the others.
@@ -177,7 +177,7 @@ class WosacSettings(SimulationConfig):
     """Settings of the simulation; each of the 32 rollouts of a search comes from a tree of its own."""
 
     #: Score that a search lowers. `agent`: as is best for the agent; `discriminator`: what its own one calls unreal;
-    #: `rule`: collisions, also those within half a second if all keep speed and course, and time off the road.
+    #: `rule`: collisions, also those half a second later if all keep speed and course, and time off the road.
     score: WosacScore = "agent"
     #: Share of the variance of an agent's random numbers that is drawn once per rollout, so that some agents are fast
     #: throughout and others slow; 0: every step draws anew. Logged drivers have .17 (simulated towns) or .32 (NGSIM).

@@ -331,9 +331,11 @@ _AGENT_FIELDS += ["route_first", "route_count", "follow_first", "follow_count", 
 
 
 def _edges(boundary: Polylines, levels: Levels) -> dict[str, NDArray[Any]]:
-    """Return the simplified boundary as segments, with the heights of their middles where there are levels."""
+    """Return the boundary as segments: simplified, or where there are levels with the heights of their middles."""
     numbers = boundary.points[:, : 2 if levels.flat else 3].astype(np.float64)
-    lines = shapely.simplify(shapely.linestrings(numbers, indices=boundary.line_index), BOUNDARY_TOLERANCE)
+    lines = shapely.linestrings(numbers, indices=boundary.line_index)
+    if levels.flat:  # a bridge that is straight from above rises and falls
+        lines = shapely.simplify(lines, BOUNDARY_TOLERANCE)
     found, line = shapely.get_coordinates(lines, include_z=not levels.flat, return_index=True)
     points = found.astype(np.float32)
     start, end, previous, following = segments_of(points, np.searchsorted(line, np.arange(len(boundary) + 1)))

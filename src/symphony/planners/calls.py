@@ -67,18 +67,31 @@ def _at_most(seconds: float) -> Iterator[None]:
         yield
         return
 
-    rung = list[str]()
+    # Raised again at the end: a planner that catches everything must not keep them.
+    raised = list[BaseException]()
+    usual = {k: handler for k in (signal.SIGINT, signal.SIGTERM) if callable(handler := signal.getsignal(k))}
 
     def ring(number: int, frame: FrameType | None) -> None:
-        rung.append("" if frame is None else f" ({Path(frame.f_code.co_filename).name}:{frame.f_lineno})")
-        raise _Overdue(rung[0])
+        where = "" if frame is None else f" ({Path(frame.f_code.co_filename).name}:{frame.f_lineno})"
+        raised.append(_Overdue(where))
+        raise raised[-1]
 
-    before = signal.signal(signal.SIGALRM, ring)
+    def stop(number: int, frame: FrameType | None) -> None:
+        try:
+            usual[signal.Signals(number)](number, frame)
+        except KeyboardInterrupt as error:
+            raised.insert(0, error)
+            raise
+
+    handlers = {signal.SIGALRM: ring, **dict.fromkeys(usual, stop)}
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
-    if rung:  # of a planner that catches everything
-        raise _Overdue(rung[0])
+        for number, handler in before.items():
+            if signal.getsignal(number) == handlers[number]:  # else the usual one has turned itself off
+                signal.signal(number, handler)
+        if raised:
+            raise raised[0]

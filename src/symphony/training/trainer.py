@@ -118,8 +118,8 @@ class Skips:
             if self.in_row[name] >= PATIENCE:
                 raise TrainingError(
                     f"the gradient of the {name} network (loss_{name} is {values[f'loss_{name}'].item():g}) was not "
-                    f"finite in {PATIENCE} updates in a row; the last checkpoint is intact: lower the learning rate, "
-                    "or check the data"
+                    f"finite in {PATIENCE} updates in a row: train anew in another folder with a lower learning "
+                    "rate, or check the data"
                 )
         return bad
 
@@ -436,8 +436,8 @@ def _changed(before: Any, after: Any, where: str = "") -> list[str]:
 def warm_start(agent: Agent, run: Path) -> None:
     """Take over the networks that another run has too.
 
-    Raises ConfigError if there is no such run, or it learned another time step, and CheckpointError if its networks
-    have other shapes, with the settings of the agent that differ.
+    Raises ConfigError if there is no such run, it learned another time step or action space, and CheckpointError if
+    its networks have other shapes, with the settings of the agent that differ.
     """
     folder, which = split_name(str(run))
     source = choose(folder, which)
@@ -446,6 +446,8 @@ def warm_start(agent: Agent, run: Path) -> None:
     before = read_spec(folder)
     if agent.spec is not None:
         dataclasses.replace(agent, name=str(run), spec=before).check_step(agent.spec.dt)
+        if "policy" in shared and before.action_space != (wanted := agent.spec.action_space):
+            raise ConfigError(f"{run}: its agent has another action_space: {before.action_space}, not {wanted}")
     try:
         load_checkpoint(source, modules=shared, partial=True, restore_rng=False)
     except CheckpointError as error:

@@ -271,7 +271,8 @@ def _road(root: Any, origin: Doubles) -> tuple[RoadMap, dict[str, str]]:
         points += len(lane.line)
         refuse(points > schema.MAX_POINTS, f"more than {schema.MAX_POINTS} points", "lane_segments")
         if len(lane.line):
-            lanes.setdefault(lane.name, lane)
+            refuse(lane.name in lanes, "two of one id", f"lane_segments {lane.name}")
+            lanes[lane.name] = lane
             bounds += marked
     areas = list(each("drivable_areas", _outline, NO_AREA))
     crossings = list(each("pedestrian_crossings", _crossing, NO_CROSSING))

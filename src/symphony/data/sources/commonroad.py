@@ -320,6 +320,7 @@ def _map(root: ET.Element, steps: NDArray[np.int64], origin: Doubles, odd: Odd) 
     limits: dict[int, float] = {}
     for node in root.findall("trafficSign"):
         for limit in readable(NO_SIGN, odd, _speed_limits, node):
+            refuse(limits.keys() & limit.keys(), "two of one id", f"trafficSign {[*limit]}")
             limits |= limit
     nodes = root.findall("lanelet")
     lanelets = [each for node in nodes for each in readable(NO_LANELET, odd, _lanelet, node, limits)]
@@ -392,6 +393,7 @@ def _signals(root: ET.Element, ways: Sequence[_Lanelet], steps: NDArray[np.int64
     wanted = {ref for way in ways for ref in way.lights}
     for node in root.findall("trafficLight"):
         for name, direction, states in readable(NO_LIGHT, odd, _light, node, steps, wanted):
+            refuse(name in known, "two of one id", f"trafficLight {name}")
             known[name] = direction, states
             schema.check_signals(len(known), len(steps), "trafficLight")
     found: Lights = {}

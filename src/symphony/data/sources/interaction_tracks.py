@@ -30,6 +30,7 @@ _TYPES = {
 NOMINAL = {AgentType.PEDESTRIAN: (0.7, 0.7), AgentType.CYCLIST: (1.8, 0.7)}
 """Length and width in metres of agents whose box the format does not give."""
 CYCLING = 2.5  # m/s: of the type ``pedestrian/bicycle``, tracks whose fastest tenth is faster are cyclists
+APART = 4.0  # metres from their mean, beyond which two positions at one time are those of two agents
 MAX_GAP_MS = 1000  # longest time step that is taken for one
 SIGMA = 0.2  # seconds: of the Gaussian weights of the line whose slope is the velocity
 WALKING = 1.0  # m/s above which the direction of motion is a heading
@@ -219,6 +220,9 @@ def merged(rows: Rows) -> Rows:
     np.add.at(total, number, rows.state[:, :4])
     found = rows.take(first)
     found.state[:, :4] = total / np.bincount(number)[:, None]
+    off = np.hypot(*(rows.state[:, :2] - found.state[number, :2]).T) > APART
+    wrong = rows.track[off | (rows.kind != found.kind[number])]
+    refuse(len(wrong), f"track {wrong[:1]} has states at one time that are far apart or of two types", "track_id")
     return found
 
 

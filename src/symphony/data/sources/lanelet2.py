@@ -141,7 +141,9 @@ def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
         for node in _living(root, "relation"):
             tags = _tags(node)
             kinds.setdefault(tags.get("type", ""), []).append((node, tags))
-        rules = dict(_rule(node, tags, ways) for node, tags in kinds.get("regulatory_element", ()))
+        told = [_rule(node, tags, ways) for node, tags in kinds.get("regulatory_element", ())]
+        rules = dict(told)
+        refuse(len(rules) < len(told), "two of one id", "regulatory_element")
         wanted = kinds.get("lanelet", [])
         lanelets = [each for found in wanted for each in readable(NO_LANELET, odd, _lanelet, *found, ways)]
         refuse(not lanelets, f"has no lanelets {odd.get(NO_LANELET, '')}".strip(), "relation")
@@ -163,6 +165,7 @@ def _ways(root: ET.Element, projection: Projection, odd: dict[str, str]) -> dict
     ways = {}
     for node in _living(root, "way"):
         way_id = base.integer(node.get("id"), "way id")
+        refuse(way_id in ways, "two of one id", f"way {way_id}")
         refs = [base.integer(child.get("ref"), f"way {way_id}: nd") for child in node.findall("nd")]
         missing = [ref for ref in refs if ref not in places]
         if missing:
@@ -180,6 +183,7 @@ def _places(root: ET.Element, projection: Projection) -> dict[int, Doubles]:
     nodes = list(_living(root, "node"))
     refuse(len(nodes) > MAX_NODES, f"{len(nodes)} nodes, at most {MAX_NODES} can be read", "node")
     ids = [base.integer(node.get("id"), "node id") for node in nodes]
+    refuse(len(set(ids)) < len(ids), "two of one id", "node")
 
     def numbers(texts: Sequence[tuple[str | None, str | None]], what: str) -> Doubles:
         both = zip(ids, texts, strict=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from symphony.data.segment import RunSegment
+from symphony.data.sources.base import located
 from symphony.data.sources.sumo.extract import DT, CropRule, crop_rule, cut_segments
 from symphony.data.sources.sumo.networks import (
     NETWORKS,
@@ -71,7 +72,8 @@ def generate_run(
         if not network.lanes:
             raise DataError("has no roads for cars", file=Path(kind))
         if own:
-            slow_bends(file)
+            with located(field="lanes"):
+                slow_bends(file)
         # On the user's own roads traffic comes from where streets begin at the edge of the map, and circulates.
         through = ramp or (own and bool(network.sources()))
         street = kind == "street"

@@ -398,8 +398,10 @@ def _limited(root: ET.Element) -> ET.ElementTree[ET.Element]:
     for node in root.iter():
         node.tag = node.tag.rpartition("}")[2]
     refuse(root.find("road[@rule='LHT']") is not None, "drives on the left, which is not supported", "rule")
+    units = {node.get("unit", "m/s") for node in root.iter("speed")} - {"m/s", "km/h", "mph"}
+    refuse(units, f"unknown unit {', '.join(sorted(units))}", "speed")
     for road in root.iterfind("road"):
-        limits = [(number(kind.get("s"), "type"), kind.find("speed")) for kind in road.iterfind("type")]
+        limits = [(number(kind.get("s"), "type"), _limit(kind.find("speed"))) for kind in road.iterfind("type")]
         sections = road.findall("lanes/laneSection")
         begins = [number(section.get("s"), "laneSection") for section in sections]
         for section, begin, end in zip(sections, begins, [*begins[1:], np.inf], strict=True):
@@ -408,16 +410,19 @@ def _limited(root: ET.Element) -> ET.ElementTree[ET.Element]:
                 own = lane.find("speed")
                 until = end if own is None else begin + number(own.get("sOffset", "0"), "speed")
                 place = len(lane) if own is None else list(lane).index(own)
-                # A road may have a limit that is no number, "no limit" or "undefined"; a lane may not.
                 lane[place:place] = [
-                    ET.Element("speed", limit.attrib, sOffset=f"{max(at - begin, 0.0):.9g}")
+                    ET.Element("speed", limit, sOffset=f"{max(at - begin, 0.0):.9g}")
                     for at, limit in limits
-                    if at >= first
-                    and max(at, begin) < until
-                    and limit is not None
-                    and limit.get("max", "")[:1].isdigit()
+                    if at >= first and max(at, begin) < until
                 ]
     return ET.ElementTree(root)
+
+
+def _limit(speed: ET.Element | None) -> dict[str, str]:
+    """Return the attributes of a road's limit as a lane may have them: a number, where it ends another, too."""
+    if speed is None or not (limit := speed.get("max", ""))[:1].isdigit():
+        return {"max": "36.1" if speed is not None and limit == "no limit" else "13.89"}  # 130 km/h; SUMO's default
+    return speed.attrib
 
 
 def slow_bends(file: Path) -> None:
