@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
@@ -22,7 +23,8 @@ from symphony.data.builtin import builtin_store
 from symphony.data.segment import AgentType, Polylines, RunSegment, content_hash
 from symphony.data.sources.commonroad import CommonRoadReader
 from symphony.data.store import SegmentStore
-from symphony.errors import DataError
+from symphony.errors import ConfigError, DataError
+from symphony.evaluation.evaluator import evaluate
 from symphony.learning.demonstrations import SceneDataset
 from symphony.saved.export import commonroad
 from symphony.saved.folder import KEY, About, RolloutWriter, load_rollouts, read_tensors, tensors_of
@@ -211,6 +213,15 @@ def test_an_index_or_a_manifest_that_lies_is_refused(file, change, message, tmp_
     path.write_text(text + "\n")
     with pytest.raises(DataError, match=message):
         load_rollouts(tmp_path / "sim")[0]
+
+
+@pytest.mark.parametrize("name", [AGENT, "idm"])
+def test_agents_that_follow_routes_need_them(name: str, tmp_path: Path) -> None:
+    agent, how = load_agent(name), EvaluateConfig(rollouts=2, duration=1)
+    without = SceneDataset(SegmentStore(builtin_store("test")), 2, agent.dynamics, [0], duration=1)
+    for call in (evaluate, partial(save_simulation, tmp_path / "sim")):
+        with pytest.raises(ConfigError, match="routes=True"):
+            call(agent, without, how)
 
 
 def test_a_simulation_is_kept_whatever_the_batch_and_the_interruptions(tmp_path):

@@ -219,7 +219,7 @@ class Demo(shared.Command):
         more |= {"data": symphony.builtin_store("train"), "out": run, "steps": self.steps, "seed": self.seed}
         symphony.train(symphony.TrainConfig(method="bc_h", **more))
         show({"your BC+H": str(run)}, self.out / "rollouts.png")
-        shared.say(f"numbers: {numbers}\nagent:   {run}\nnext:    symphony test examples/suite.toml tests a planner")
+        shared.say(f"numbers: {numbers}\nagent:   {run}\nnext:    symphony evaluate {run} --data DIR")
 
 
 class Doctor(shared.Command):
@@ -233,7 +233,7 @@ class Doctor(shared.Command):
         began, second = time.perf_counter(), symphony.EvaluateConfig(rollouts=2, duration=1)
         test = symphony.builtin_store("test")
         numbers = symphony.evaluate("pretrained:bc_ts_h", test, second, items=[0]).numbers()
-        spent, held = time.perf_counter() - began, {one.name: one.version for one in distributions()}
+        spent, held = time.perf_counter() - began, {one.name: one.version for one in reversed([*distributions()])}
         devices = [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
         found: dict[str, Any] = {
             "symphony": {"version": symphony.__version__, "at": symphony.__file__},

@@ -20,6 +20,7 @@ from torch import Tensor
 from symphony.agents import Agent, load_agent
 from symphony.config import EvaluateConfig
 from symphony.data.store import SegmentStore
+from symphony.envs.driving import NO_ROUTES
 from symphony.envs.objects import rollout_heights
 from symphony.envs.scene import SceneBatch
 from symphony.errors import ConfigError
@@ -88,7 +89,7 @@ def evaluate(
         observe: called in this process with the rollouts of every run segment, to draw or keep them.
 
     Raises:
-        ConfigError: if the agent learned another time step than the segments have.
+        ConfigError: if the agent learned another time step than the segments have, or scenes lack its routes.
         DataError: if the store is empty, a segment has no ego at its first step, or too few agents.
         NotFiniteError: if a network of the agent puts out a number that is not finite.
     """
@@ -97,6 +98,8 @@ def evaluate(
     if isinstance(data, SceneDataset):
         if items is not None:
             raise ConfigError("items are those of a store; these scenes are chosen already")
+        if agent.routed and not data.routes:
+            raise ConfigError(NO_ROUTES)
         dataset = data
     else:
         store = (data if isinstance(data, SegmentStore) else SegmentStore(data)).filled()

@@ -15,6 +15,7 @@ import torch
 
 from symphony.agents import Agent
 from symphony.config import EvaluateConfig
+from symphony.envs.driving import NO_ROUTES
 from symphony.errors import ConfigError, DataError
 from symphony.learning.demonstrations import SceneDataset
 from symphony.planners.calls import SECONDS
@@ -62,6 +63,8 @@ def save_simulation(
     after = getattr(config, "after_collision", "go-on")
     if agent.policy is None and not planner and (config.others, after) != ("log", "go-on"):
         raise ConfigError("log playback without a planner is all log: no --others, no --after-collision")
+    if agent.routed and not dataset.routes:
+        raise ConfigError(NO_ROUTES)
     planners: Planners = {None: planner, **(drives or {})} if planner else {}
     config = beside_planner(config) if planner else config
     settings = plain_settings(config, agent, dataset.interactive, dataset.duration)
