@@ -142,6 +142,8 @@ def test_speed_limits_of_either_version(path: Path) -> None:
     for kind, expected in (("274", 13.5), ("R2-1", 13.5), ("274.1", 13.5), ("B14", 13.5), ("206", np.nan)):
         found = convert(path, driver(7), lane, sign.format(kind)).road.speed_limit
         np.testing.assert_array_equal(found, np.float32([expected]))
+    with pytest.raises(AssertionError, match=r"trafficSign \[5\]: two of one id"):
+        convert(path, driver(7), lane, 2 * sign.format("274"))
 
 
 def test_what_lies_beside_the_lanes_is_road_and_no_lane(path: Path) -> None:

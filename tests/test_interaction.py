@@ -111,6 +111,10 @@ def test_cases_of_the_newer_layout(tmp_path: Path) -> None:
         assert (segment.predict.tolist(), segment.interest.tolist()) == ([1], [0])
         assert segment.agent_type[0] == AgentType.PEDESTRIAN
         np.testing.assert_allclose(segment.position[1, 0] + segment.origin, (x + 1, 2, 0), atol=1e-4)
+    cells = [row.split(",") for row in rows if row[0] == "2"]
+    on = [",".join([*some[:3], str(int(some[3]) + 5000), *some[4:]]) for some in cells]
+    on += [row for row in rows if row[0] == "1"]
+    assert [s.current_step for s in segments(cases(tmp_path / "train", "DR_Y", on))] == [9, 9]
     late = [row for row in rows if row[0] == "1" or int(row.split(",")[2]) > 5]
     assert [s.current_step for s in segments(cases(tmp_path / "train", "DR_Y", late))] == [9, 5]
 

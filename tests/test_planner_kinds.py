@@ -194,24 +194,29 @@ def test_one_that_takes_too_long_fails_its_run(store: Path, tmp_path: Path, how:
         assert saved.counted[0].sum() == 3
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_what_ends_the_command_is_not_the_planners_to_catch(
-    store: Path, tmp_path: Path, number: signal.Signals
-) -> None:
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize(("number", "how"), [
+    (signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit), (signal.SIGTERM, OSError),
+])  # fmt: skip
+def test_what_ends_the_command_is_not_the_planners_to_catch(store, tmp_path, number, how, late):
     def careful(observation: Observation) -> tuple[float, float]:
         with contextlib.suppress(BaseException):
+            time.sleep(2 * late)
+        signal.signal(signal.SIGALRM, signal.SIG_IGN)  # for an alarm of its own
+        with contextlib.suppress(BaseException):
             os.kill(os.getpid(), number)
-            time.sleep(60)
+            time.sleep(1)
         return -5.0, 0.0
 
     def ended(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
+        signal.signal(number, signal.SIG_IGN)
+        raise how
 
-    before = signal.signal(number, ended)
+    alarm, before = signal.getsignal(signal.SIGALRM), signal.signal(number, ended)
     try:
-        with pytest.raises(KeyboardInterrupt):
-            alone(store, tmp_path / "sim", careful)
-        assert signal.getsignal(number) is ended
+        with pytest.raises(how):
+            alone(store, tmp_path / "sim", careful, planner_seconds=0.2 if late else 60)
+        assert (signal.getsignal(number), signal.getsignal(signal.SIGALRM)) == (signal.SIG_IGN, alarm)
     finally:
         signal.signal(number, before)
 

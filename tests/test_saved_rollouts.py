@@ -222,6 +222,8 @@ def test_agents_that_follow_routes_need_them(name: str, tmp_path: Path) -> None:
     for call in (evaluate, partial(save_simulation, tmp_path / "sim")):
         with pytest.raises(ConfigError, match="routes=True"):
             call(agent, without, how)
+    with pytest.raises(ConfigError, match="routes=True"):
+        save_simulation(tmp_path / "sim", load_agent("playback"), without, how, planner="idm")
 
 
 def test_a_simulation_is_kept_whatever_the_batch_and_the_interruptions(tmp_path):

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 SPACING = 2.0  # metres between the points that stand for a polyline in the observation
 BOUNDARY_TOLERANCE = 0.02  # metres by which the simplified road boundary may depart from the given one
+LONGEST = 20.0  # metres of a piece of boundary where there are levels, unless its points are farther apart
 MARGIN = 5.0  # metres beyond the convex hull of the lanes that still belong to the map
 COORDINATES = 5  # of a logged state: no field has more of them
 BESIDE = 2.5  # metres to either side of the end of a lane within which an agent leaves by it
@@ -331,13 +332,14 @@ _AGENT_FIELDS += ["route_first", "route_count", "follow_first", "follow_count", 
 
 
 def _edges(boundary: Polylines, levels: Levels) -> dict[str, NDArray[Any]]:
-    """Return the boundary as segments: simplified, or where there are levels with the heights of their middles."""
-    numbers = boundary.points[:, : 2 if levels.flat else 3].astype(np.float64)
-    lines = shapely.linestrings(numbers, indices=boundary.line_index)
-    if levels.flat:  # a bridge that is straight from above rises and falls
-        lines = shapely.simplify(lines, BOUNDARY_TOLERANCE)
-    found, line = shapely.get_coordinates(lines, include_z=not levels.flat, return_index=True)
-    points = found.astype(np.float32)
+    """Return the simplified boundary as segments, with the heights of their middles where there are levels."""
+    every = np.column_stack([boundary.points[:, :2].astype(np.float64), np.arange(len(boundary.points))])
+    lines = shapely.simplify(shapely.linestrings(every, indices=boundary.line_index), BOUNDARY_TOLERANCE)
+    kept = shapely.get_coordinates(lines, include_z=True)[:, 2].astype(np.int64)
+    if not levels.flat:  # a bridge that is straight from above rises and falls
+        way = np.cumsum(np.hypot(*np.diff(every[:, :2], axis=0, prepend=every[:1, :2]).T))
+        kept = np.union1d(kept, np.flatnonzero(np.diff(way // LONGEST)))
+    points, line = boundary.points[kept, : 2 if levels.flat else 3].astype(np.float32), boundary.line_index[kept]
     start, end, previous, following = segments_of(points, np.searchsorted(line, np.arange(len(boundary) + 1)))
     # Of two points of a line that differ one after the other.
     pair = np.flatnonzero((line[1:] == line[:-1]) & (points[1:, :2] != points[:-1, :2]).any(-1))

@@ -49,26 +49,26 @@ def _batch(kind: Any, planners: list[Planner], seen: list[Traffic]) -> list[Any]
 
 def answer(call: Any, *args: Any, seconds: float = SECONDS) -> Any:
     """Call a planner; return what it returns, or the exception that ended it: a TimeoutError if it took too long."""
+    stopped: list[BaseException] = []
     try:
-        with _at_most(seconds):
+        with _at_most(seconds) as stopped:
             return call(*args)
     except _Overdue as late:
         return TimeoutError(f"took more than {seconds:g} s{late}")
-    except KeyboardInterrupt:
-        raise
     except BaseException as error:  # whatever a user's planner raises: a cancelled task is no Exception
+        if isinstance(error, KeyboardInterrupt) or error in stopped:
+            raise
         return error if isinstance(error, Exception) else RuntimeError(f"raised {error!r}")
 
 
 @contextlib.contextmanager
-def _at_most(seconds: float) -> Iterator[None]:
-    """Raise ``_Overdue`` inside after this many seconds, where signals are available."""
+def _at_most(seconds: float) -> Iterator[list[BaseException]]:
+    """Raise ``_Overdue`` inside after this many seconds, where signals are available; give what signals raised."""
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield []
         return
 
-    # Raised again at the end: a planner that catches everything must not keep them.
-    raised = list[BaseException]()
+    raised = list[BaseException]()  # and again at the end: a planner that catches everything must not keep them
     usual = {k: handler for k in (signal.SIGINT, signal.SIGTERM) if callable(handler := signal.getsignal(k))}
 
     def ring(number: int, frame: FrameType | None) -> None:
@@ -79,7 +79,7 @@ def _at_most(seconds: float) -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> None:
         try:
             usual[signal.Signals(number)](number, frame)
-        except KeyboardInterrupt as error:
+        except BaseException as error:
             raised.insert(0, error)
             raise
 
@@ -87,11 +87,11 @@ def _at_most(seconds: float) -> Iterator[None]:
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
-        yield
+        yield raised
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
-            if signal.getsignal(number) == handlers[number]:  # else the usual one has turned itself off
+            if number == signal.SIGALRM or signal.getsignal(number) == handlers[number]:  # else it was turned off
                 signal.signal(number, handler)
         if raised:
             raise raised[0]

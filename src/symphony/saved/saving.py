@@ -63,7 +63,7 @@ def save_simulation(
     after = getattr(config, "after_collision", "go-on")
     if agent.policy is None and not planner and (config.others, after) != ("log", "go-on"):
         raise ConfigError("log playback without a planner is all log: no --others, no --after-collision")
-    if agent.routed and not dataset.routes:
+    if (agent.routed or planner or goals) and not dataset.routes:
         raise ConfigError(NO_ROUTES)
     planners: Planners = {None: planner, **(drives or {})} if planner else {}
     config = beside_planner(config) if planner else config

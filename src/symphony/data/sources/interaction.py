@@ -173,7 +173,7 @@ class InteractionReader(Reader):
         refuse(not len(candidates), "no moving vehicle is observed at every step", "track_id")
         times = np.rint(scene.start + 1000 * scene.dt * (begin + there)).astype(np.int64)
         shown = {k: (place, _states_at(since, s, times)) for k, (place, since, s) in scene.lights.items()}
-        current = 0 if scene.files.single else max(HISTORY - begin, 0)
+        current = 0 if scene.files.single else HISTORY - begin * (begin <= HISTORY)
         segment = RunSegment(
             segment_id=name,
             source=self.name,

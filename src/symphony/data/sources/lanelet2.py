@@ -141,8 +141,7 @@ def read_lanelet2(path: Path, projection: Projection) -> LaneletMap:
         for node in _living(root, "relation"):
             tags = _tags(node)
             kinds.setdefault(tags.get("type", ""), []).append((node, tags))
-        told = [_rule(node, tags, ways) for node, tags in kinds.get("regulatory_element", ())]
-        rules = dict(told)
+        rules = dict(told := [_rule(node, tags, ways) for node, tags in kinds.get("regulatory_element", ())])
         refuse(len(rules) < len(told), "two of one id", "regulatory_element")
         wanted = kinds.get("lanelet", [])
         lanelets = [each for found in wanted for each in readable(NO_LANELET, odd, _lanelet, *found, ways)]

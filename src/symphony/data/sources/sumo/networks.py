@@ -398,10 +398,11 @@ def _limited(root: ET.Element) -> ET.ElementTree[ET.Element]:
     for node in root.iter():
         node.tag = node.tag.rpartition("}")[2]
     refuse(root.find("road[@rule='LHT']") is not None, "drives on the left, which is not supported", "rule")
-    units = {node.get("unit", "m/s") for node in root.iter("speed")} - {"m/s", "km/h", "mph"}
-    refuse(units, f"unknown unit {', '.join(sorted(units))}", "speed")
+    units = {each.get("unit", "m/s") for each in root.iter("speed") if each.get("max", "")[:1].isdigit()}
+    refuse(units - {"m/s", "km/h", "mph"}, f"unknown unit among {', '.join(sorted(units))}", "speed")
     for road in root.iterfind("road"):
         limits = [(number(kind.get("s"), "type"), _limit(kind.find("speed"))) for kind in road.iterfind("type")]
+        limits = [each for k, each in enumerate(limits) if each[1] != (limits[k - 1][1] if k else {})]
         sections = road.findall("lanes/laneSection")
         begins = [number(section.get("s"), "laneSection") for section in sections]
         for section, begin, end in zip(sections, begins, [*begins[1:], np.inf], strict=True):
@@ -411,17 +412,17 @@ def _limited(root: ET.Element) -> ET.ElementTree[ET.Element]:
                 until = end if own is None else begin + number(own.get("sOffset", "0"), "speed")
                 place = len(lane) if own is None else list(lane).index(own)
                 lane[place:place] = [
-                    ET.Element("speed", limit, sOffset=f"{max(at - begin, 0.0):.9g}")
+                    ET.Element("speed", limit or {"max": "13.89"}, sOffset=f"{max(at - begin, 0.0):.9g}")
                     for at, limit in limits
-                    if at >= first and max(at, begin) < until
+                    if at >= first and max(at, begin) < until and (limit or at > begin)
                 ]
     return ET.ElementTree(root)
 
 
 def _limit(speed: ET.Element | None) -> dict[str, str]:
-    """Return the attributes of a road's limit as a lane may have them: a number, where it ends another, too."""
+    """Return the attributes of a limit, with a number; none where SUMO takes its own, by the type of the lane."""
     if speed is None or not (limit := speed.get("max", ""))[:1].isdigit():
-        return {"max": "36.1" if speed is not None and limit == "no limit" else "13.89"}  # 130 km/h; SUMO's default
+        return {"max": "36.1"} if speed is not None and limit == "no limit" else {}  # 130 km/h
     return speed.attrib
 
 
