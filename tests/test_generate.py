@@ -35,9 +35,9 @@ from symphony.data.segment import AgentType, MarkType, RoadMap, RunSegment, Sign
 from symphony.data.selection import MOVING, exclusion, interactive_agents, travel
 from symphony.data.sources import sumo
 from symphony.data.sources.sumo import process
-from symphony.data.sources.sumo.networks import own_network, slow_bends, town
+from symphony.data.sources.sumo.networks import drive_as_drawn, own_network, town
 from symphony.data.sources.sumo.process import run_program
-from symphony.data.sources.sumo.roads import read_network
+from symphony.data.sources.sumo.roads import read_network, shape
 from symphony.data.store import SegmentStore
 from symphony.data.store_writer import StoreWriter
 from symphony.envs.routes import route_table
@@ -475,7 +475,7 @@ def test_lanes_lie_where_opendrive_has_them(tmp_path: Path) -> None:
         assert all((np.diff(each) > 0).all() for each in ahead)
         assert sum(map(np.ptp, ahead)) == pytest.approx(truth.length, abs=0.5)
         assert [w for _, w in mine] == pytest.approx([width] * 2, abs=0.01)
-    slow_bends(net)
+    drive_as_drawn(net, own=True)
     slow = [v for line, v in zip(network.lanes, read_network(net).speed, strict=True) if len(line) > 2]
     assert max(slow) < np.sqrt(3.0 / 0.02) * 1.05
     assert generate(Plan(1, kinds=(str(file),)), tmp_path / "store").complete
@@ -552,15 +552,16 @@ def test_only_lanes_for_cars_count_on_either_side_of_the_road(tmp_path: Path, mo
 def test_lanes_are_beside_each_other_where_cars_may_change(tmp_path: Path, rule: str) -> None:
     """24 streets of three lanes: the middle one has a rule of its own."""
     run_program("netgenerate", "--grid --grid.number 3 --default.lanenumber 3 --output-file g.net.xml", tmp_path)
-    middle = r'<lane id="\w+_1"'
-    (file := tmp_path / "g.net.xml").write_text(re.sub(middle, rf"\g<0> {rule}", file.read_text()))
+    middle, file = r'<lane id="\w+_1"', tmp_path / "g.net.xml"
+    file.write_text(re.sub(middle, rf"\g<0> {rule}", file.read_text().replace(' length="', ' length="9')))
     network = read_network(net := own_network(file, tmp_path))
     lanes, left, right = (3, 1, 2) if "change" in rule else (2, 0, 0)
-    assert (~network.internal).sum() == 24 * lanes
-    assert [len(pairs) for pairs in network.beside] == [24 * left, 24 * right]
+    assert [(~network.internal).sum(), *map(len, network.beside)] == [24 * lanes, 24 * left, 24 * right]
     assert (network.beside[0] @ [-1, 1] == 1).all()
-    slow_bends(net)
+    drive_as_drawn(net, own=True)
     assert len(re.findall(rf'{middle} [^>]*allow="pedestrian"', net.read_text())) == 24 * (3 - lanes)  # nor buses
+    for length, line in re.findall(r'<lane id="\w+" [^>]* length="(\S+)" [^>]*shape="([^"]+)"', net.read_text()):
+        assert float(length) == pytest.approx(shapely.LineString(shape(line)).length, abs=0.1)  # not the file's
 
 
 @needs_sumo
@@ -596,5 +597,4 @@ def test_builtin_sets_are_small_varied_and_apart() -> None:
         turns, lit = [np.ptp(s.heading[s.ego]) > 0.5 for s in store], [len(s.signal_lane) > 0 for s in store]
         assert 0.25 < np.mean(turns) < 0.8
         assert np.mean(lit) > 0.25
-    folder = builtin_store("train").parent
-    assert sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) < 5e6
+    assert sum(file.stat().st_size for file in builtin_store("train").parent.rglob("*") if file.is_file()) < 5e6

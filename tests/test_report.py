@@ -108,7 +108,8 @@ def test_a_known_profile_has_its_acceleration_jerk_and_lateral_acceleration() ->
     straight, turning = rows(saved)
     assert straight["max_braking"] == pytest.approx(-np.diff(speed).min() / DT, rel=1e-4)
     assert straight["max_jerk"] == pytest.approx(np.abs(np.diff(speed, 2)).max() / DT**2, rel=1e-3)
-    assert (straight["max_lateral_acceleration"], turning["max_jerk"]) == (0, pytest.approx(0, abs=1e-3))
+    zeros = straight["max_lateral_acceleration"], straight["max_acceleration"], turning["max_braking"]
+    assert (*zeros, turning["max_jerk"]) == (0, 0, 0, pytest.approx(0, abs=1e-3))
     assert turning["max_lateral_acceleration"] == pytest.approx(5.95, rel=1e-4)
 
 

@@ -152,7 +152,8 @@ def test_chosen_segments_pictures_and_animations(tmp_path: Path, capsys: pytest.
         with Image.open(tmp_path / name) as image:
             assert getattr(image, "n_frames", 1) == (1 if name == "a.png" else 21)
     wrong = {("--out", str(tmp_path / "a.doc")): ".mp4", ("--segments", "nothing"): "no rollouts of this segment"}
-    wrong["--rollouts", "1"] = "a page plays all"
+    save_rollouts(tmp_path / "other", ABOUT, pages()[2:3])
+    wrong |= {("--rollouts", "1"): "a page plays all", (str(tmp_path / "other"), "--out", "b.png"): "in every folder"}
     for words, why in wrong.items():
         assert main(["view", sim, *words]) == 1
         assert why in capsys.readouterr().err
@@ -258,11 +259,12 @@ def test_the_browser_reads_the_numbers_and_reacts(tmp_path: Path) -> None:
       seek(view.branch.steps.length);
       out.drawn = drawn();
       two["tree.valid"].fill(0); out.absent = drawn(); out.peak = search.peak(0, 0, 0);
+      search.total = () => 0; out.tied = out.fates.every((_, s) => search.fate(0, 0, s)[1].includes("the best"));
     """
     out = driven_page(tmp_path, script, [saved, tree])
     assert out["segments"] == [saved.segment.segment_id, tree.segment.segment_id]
     assert out["notes"] == ["0", "1 · collision, at fault"]
-    assert (out["jumped"], out["agent"], out["picked"], out["peak"]) == (10, 0, 1, None)
+    assert (out["jumped"], out["agent"], out["picked"], out["peak"], out["tied"]) == (10, 0, 1, None, True)
     np.testing.assert_allclose(out["x"], saved.state[..., 0, 0].ravel(), atol=6e-4)
     np.testing.assert_allclose(out["h"], saved.state[..., 0, 2].ravel(), atol=6e-5)
     told = {"2.0 s": "events", "into leader at fault": "events", "vehicle": "who", "rollout=1": "hash"}

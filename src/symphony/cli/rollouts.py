@@ -86,7 +86,8 @@ class View(shared.Command):
     """Make a page that plays saved rollouts: it opens from disk in any browser, without a network.
 
     Several folders play side by side, with metrics over time below; rollouts can be chosen by their events, plans and
-    branches of a search are drawn. With --out, make a picture or a film instead, by default of the first segments.
+    branches of a search are drawn. With --out, make a picture or a film instead, by default of the first segments;
+    all folders must hold each.
     """
 
     folders: shared.SavedFolders
@@ -112,15 +113,14 @@ class View(shared.Command):
                 from symphony.evaluation.report import report
 
                 write_view(folders, [report(folder, picked=True) for folder in folders], out)
-            elif not names:
-                raise errors.ConfigError(f"{self.folders[0]} holds no rollouts to draw")
+            elif not (names := [name for name in names if all(name in folder.ids for folder in folders)]):
+                raise errors.ConfigError("no run segment has rollouts to draw in every folder")
             else:
                 count = self.rollouts or (None if out.suffix[1:].lower() in FORMATS else 1)
                 for name in names if self.segments else names[:6]:
                     for place, folder in zip(places(folders), folders, strict=True):
-                        if name in folder.ids:
-                            title = errors.printable(f"{place}{shared.short_name(folder.about.agent)}: {name}")
-                            clips.append(render.saved_clip(folder.of(name), count, title))
+                        title = errors.printable(f"{place}{shared.short_name(folder.about.agent)}: {name}")
+                        clips.append(render.saved_clip(folder.of(name), count, title))
                 render.draw_clips(clips, out, columns=len(folders) if len(folders) > 1 else 3)
         shared.say(f"written: {out}")
 

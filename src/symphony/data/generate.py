@@ -31,7 +31,7 @@ Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 DURATIONS = (10, 20, 30)  # seconds a segment may last
 
-VERSION = 3
+VERSION = 4
 """Version of this generator: another may give other segments for the same plan, and does not continue a store."""
 FIRST_NETWORK = 1_000_000  # seeds of networks below this are left to the built-in set and to experiments
 BLOCK = 100_000  # networks that a seed has for each split

@@ -125,14 +125,15 @@ def dense(lines: Polylines) -> NDArray[np.float64]:
         return points  # one height: where along the lines does not matter
     step = np.diff(points, axis=0, append=points[-1:])
     step[lines.offsets[1:] - 1] = 0
-    count = np.maximum(np.ceil(np.hypot(*step[:, :2].T) / SPACING), 1).astype(np.int64)
+    return divided(points, step, SPACING)
+
+
+def divided(points: NDArray[np.float64], step: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
+    """Return points and, between each and what is a step away, others at most ``spacing`` apart in the plane."""
+    count = np.maximum(np.ceil(np.linalg.norm(step[:, :2], axis=-1) / spacing), 1).astype(np.int64)
     point = np.repeat(np.arange(len(points)), count)
-    return points[point] + shares(count)[:, None] * step[point]
-
-
-def shares(count: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return 0, 1 / n, 2 / n, ... (n - 1) / n for each number n, one after the other."""
-    return (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)) / np.repeat(count, count)
+    share = (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)) / np.repeat(count, count)
+    return points[point] + share[:, None] * step[point]
 
 
 def _columns(points: NDArray[np.floating[Any]]) -> NDArray[np.int64]:

@@ -176,7 +176,7 @@ class _Panel:
         axes.add_collection(PolyCollection(list(boxes), gid="log", **style), autolim=False)
         marks += filter(None, (plots.draw_events(axes, clip, *event, until=at) for event in plots.EVENTS))
         past = ", past the log" * (step >= segment.log_steps)
-        add_caption(axes, f"{step * segment.dt:.1f} s{past}", right=True)
+        add_caption(axes, f"{at * segment.dt:.1f} s{past}", right=True)
         return marks
 
     def _moving(self) -> list[Artist]:

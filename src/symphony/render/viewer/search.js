@@ -40,7 +40,7 @@ class SearchPanel {
 
   fate(tree, p, s) {
     const used = this.rollouts(tree, p, s), kept = this.continued(tree, p, s), order = this.ranked(tree, p);
-    const rank = order.indexOf(s) + 1, own = this.total(tree, p, s), text = v => v.toFixed(2);
+    const own = this.total(tree, p, s), text = v => v.toFixed(2), rank = 1 + order.filter(c => this.total(tree, p, c) < own).length;
     const place = `total ${text(own)}, ${rank === 1 ? "the best" : `number ${rank}`} of ${this.branches} (low is good)`;
     if (used.length) return ["kept", `${place}. Part of rollout${used.length > 1 ? "s" : ""} ${used.join(", ")}.`];
     const alive = order.filter(c => this.continued(tree, p, c).length), worst = alive.length ? this.total(tree, p, alive[alive.length - 1]) : NaN;

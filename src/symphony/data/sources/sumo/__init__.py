@@ -16,11 +16,11 @@ from symphony.data.sources.sumo.extract import DT, CropRule, crop_rule, cut_segm
 from symphony.data.sources.sumo.networks import (
     NETWORKS,
     RAMP_RADIUS,
+    drive_as_drawn,
     freeway,
     is_own,
     kind_name,
     own_network,
-    slow_bends,
 )
 from symphony.data.sources.sumo.process import scratch, sumo_version
 from symphony.data.sources.sumo.roads import read_network
@@ -52,7 +52,7 @@ def generate_run(
     times as likely to go straight on as to take any one turn. A :class:`ConfigError` says what is wrong with an
     argument, a :class:`DataError` if SUMO is not installed or failed, with its message.
     """
-    own, ramp = is_own(kind), kind == "ramp"
+    own, ramp, street = is_own(kind), kind == "ramp", kind == "street"
     if kind not in NETWORKS and not own:
         raise ConfigError(f"unknown kind of network {kind!r} (known: {', '.join(KINDS)})")
     rule = rule or crop_rule(kind)
@@ -71,12 +71,11 @@ def generate_run(
         network = read_network(file)
         if not network.lanes:
             raise DataError("has no roads for cars", file=Path(kind))
-        if own:
+        if own or street:
             with located(field="lanes"):
-                slow_bends(file)
+                drive_as_drawn(file, own=own)
         # On the user's own roads traffic comes from where streets begin at the edge of the map, and circulates.
         through = ramp or (own and bool(network.sources()))
-        street = kind == "street"
         sublane = bool(drive_rng.random() < SUBLANE_SHARE) or street
         warm_up = WARM_UP * (_OWN_FILLS if own else 1) + longer / _SLOW
         end = warm_up + duration

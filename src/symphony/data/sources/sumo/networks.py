@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from shapely import LineString
 
 from symphony.data.sources.base import Doubles, load_xml, located, number, refuse
 from symphony.data.sources.sumo.process import run_program
@@ -426,16 +427,23 @@ def _limit(speed: ET.Element | None) -> dict[str, str]:
     return speed.attrib
 
 
-def slow_bends(file: Path) -> None:
-    """Let SUMO drive all on the lanes for cars alone, as fast as bends allow: their limits are for straight roads."""
+def drive_as_drawn(file: Path, *, own: bool) -> None:
+    """Let SUMO take lanes as long as drawn, or all seem to brake; ``own`` ones only if for cars, slow in bends."""
     tree = ET.parse(file)  # noqa: S314 - written by netconvert
-    for lane in tree.iterfind("edge/lane"):
-        # Buses keep off their own lanes, too: the map has none.
-        lane.set("allow", "all" if for_cars(lane) else "pedestrian")
-        lane.attrib.pop("disallow", None)
-        if for_cars(lane):
-            line = densify(shape(lane.attrib["shape"]), BEND)
-            lane.set("speed", f"{min(float(lane.attrib['speed']), _comfortable_speed(line)):.2f}")
+    for edge in tree.iterfind("edge"):
+        lines = {lane: LineString(shape(lane.attrib["shape"])) for lane in edge.iterfind("lane")}
+        cars = [lane for lane in lines if for_cars(lane)]
+        # Those of cars are as long as each other, or a change of lane would be a jump.
+        mean = sum(lines[lane].length for lane in cars) / max(len(cars), 1)
+        for lane, line in lines.items():
+            lane.set("length", f"{max(mean if lane in cars else line.length, 0.1):.2f}")
+            if own:
+                # Buses keep off their own lanes, too: the map has none.
+                lane.set("allow", "all" if lane in cars else "pedestrian")
+                lane.attrib.pop("disallow", None)
+            if own and lane in cars:
+                speed = _comfortable_speed(densify(np.array(line.coords), BEND))
+                lane.set("speed", f"{min(float(lane.attrib['speed']), speed):.2f}")
     tree.write(file)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, Point, Polygon
 from shapely.geometry.polygon import orient
 
-from symphony.data.levels import shares
+from symphony.data.levels import divided
 from symphony.data.segment import Bools, Floats, LaneType, MarkType, Polylines, RoadMap
 from symphony.data.sources.base import Doubles
 from symphony.data.sources.lines import stretches
@@ -104,12 +104,11 @@ def read_network(file: Path) -> Network:
     """Read a compiled network (``.net.xml``): its lanes for cars."""
     root = ET.parse(file).getroot()  # noqa: S314
     side = -1 if root.get("lefthand") == "true" else 1
-    lanes: list[Doubles] = []
+    lanes, walked, crosswalks = list[Doubles](), list[Doubles](), list[Doubles]()
     width, speed, internal, edge, names = [], [], [], [], []
-    index: dict[str, int] = {}
+    index, connectors = dict[str, int](), dict[str, list[tuple[int, int, int]]]()
     beside: tuple[list[tuple[int, int]], ...] = [], []
     balance, crossed = Counter[str](), Counter[str]()
-    walked, crosswalks = list[Doubles](), list[Doubles]()
     for element in root.iter("edge"):
         if element.get("function") is None:
             balance.update({element.attrib["from"]: -1})
@@ -137,7 +136,6 @@ def read_network(file: Path) -> Network:
             beside[0].extend([way] * (near and _has_cars(one.get("changeLeft", "all"))))
             beside[1].extend([way[::-1]] * (near and _has_cars(other.get("changeRight", "all"))))
     successors, stops = set(), set()
-    connectors: dict[str, list[tuple[int, int, int]]] = {}
     for link in root.iter("connection"):
         start, end = (index.get(f"{link.attrib[which]}_{link.attrib[f'{which}Lane']}") for which in ("from", "to"))
         via = index.get(link.attrib["via"]) if "via" in link.attrib else end
@@ -307,7 +305,8 @@ def _drivable(network: Network, center: Doubles, radius: float) -> Polygon | Mul
         driven = shapely.intersects(paved, shapely.union_all(lines[near]))
         shapes = shapely.buffer(shapely.buffer(paved[driven], -_SLIVER), _SLIVER, join_style="mitre")
     union = shapely.union_all(np.concatenate([strips, shapes]))
-    return union.buffer(_SLIT, join_style="mitre").buffer(-_SLIT, join_style="mitre")
+    with np.errstate(divide="ignore", invalid="ignore"):  # of slivers
+        return union.buffer(_SLIT, join_style="mitre").buffer(-_SLIT, join_style="mitre")
 
 
 def _boundary(area: Polygon | MultiPolygon, radius: float) -> list[Doubles]:
@@ -317,15 +316,8 @@ def _boundary(area: Polygon | MultiPolygon, radius: float) -> list[Doubles]:
         simple = orient(part.simplify(_BOUNDARY_TOLERANCE))
         for ring in (simple.exterior, *simple.interiors):
             if not ring.is_empty and Polygon(ring).area >= 1.0:
-                points = _subdivide(np.asarray(ring.coords)[:, :2], _BOUNDARY_SPACING)
+                line = np.asarray(ring.coords)[:, :2]
+                points = divided(line, np.diff(line, axis=0, append=line[-1:]), _BOUNDARY_SPACING)
                 inside = np.linalg.norm(points, axis=-1) <= radius
                 lines += stretches(points, inside[:-1] & inside[1:])
     return lines
-
-
-def _subdivide(line: Doubles, spacing: float) -> Doubles:
-    """Return the same line with points added so that none are further apart than ``spacing``; vertices stay."""
-    step = np.linalg.norm(np.diff(line, axis=0), axis=-1)
-    count = np.maximum(1, np.ceil(step / spacing)).astype(int)
-    start = np.repeat(np.arange(len(step)), count)
-    return np.concatenate([line[start] + shares(count)[:, None] * np.diff(line, axis=0)[start], line[-1:]])
