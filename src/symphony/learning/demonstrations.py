@@ -319,8 +319,9 @@ class SceneDataset:
             ``ROUTES_MASK``, ``GOAL`` (-1 for vehicles on no lane) and ``GOAL_SET``, all that are equally right.
         """
         each = self.experts.many(items)
-        first_steps = [expert.valid.int().argmax(1).tolist() for expert in each]
-        found = [(i, k, t) for i, begins in enumerate(first_steps) for k, t in enumerate(begins)]
+        found = [(i, k, t) for i, fit in enumerate(each) for k, t in enumerate(fit.valid.int().argmax(1).tolist())]
+        # Routes begin where the log does, which a fit may reach later.
+        found = [(i, k, t) for i, k, t in found if each[i].progress[k, t] <= 2 * DISPLACED]  # where routes begin
         pick = None if count is None else self.pick(len(found), count, items, rng).tolist()
         chosen = found if pick is None else [found[k] for k in pick]
         item, _, when = torch.tensor(chosen).unbind(1)

@@ -19,8 +19,8 @@ AHEAD, ASIDE, TURNED, FASTER = 1.5, 0.5, 0.1, 1.5
 """Standard deviations of displacements along the road and aside (metres), in heading (radians) and in speed (m/s)."""
 SLOWEST = 2.0
 """m/s below which steering is not made harder, however slow the vehicle."""
-STEERING, BRAKING = 0.5, 4.0
-"""Largest steering angle in radians and acceleration in m/s^2 of the way back."""
+STEERING, BRAKING, TIGHTEST = 0.5, 4.0, 0.2
+"""Largest steering angle in radians, acceleration in m/s^2 and curvature of the log in 1/m of the way back."""
 
 
 def displaced(logged: Float[Tensor, "M 4"], rng: torch.Generator) -> Float[Tensor, "M 4"]:
@@ -73,7 +73,10 @@ def way_back(
     curvature = wrap(following[:, 2] - logged[:, 2]) / travelled
     after = (state[:, 3] + acceleration * dt).clamp_min(0.0)
     pace = 0.5 * (state[:, 3] + after)
-    turn = curvature * pace - 2.0 / ACROSS * turned - error[:, 1] / (ACROSS**2 * pace.clamp_min(SLOWEST))
+    # In a bend the log's own way turns between the two; the headings of slow vehicles are too noisy to tell.
+    bend = curvature.clamp(-TIGHTEST, TIGHTEST) * error[:, 0] * (pace / 4.0).clamp_max(1.0)
+    turned, aside = turned - bend, error[:, 1] - 0.5 * bend * error[:, 0]
+    turn = curvature * pace - 2.0 / ACROSS * turned - aside / (ACROSS**2 * pace.clamp_min(SLOWEST))
     target = torch.stack([state[:, 0], state[:, 1], state[:, 2] + turn * dt, after], -1)
     acceleration, steering = bicycle_inverse(state, target, length, dt)
     return bicycle_step(state, acceleration, steering.clamp(-STEERING, STEERING), length, dt)

@@ -110,8 +110,9 @@ class SearchReplay:
         found = advantages(self.env, self.leaves)
         share = found.abs().amax(-1).flatten().clamp_min(1e-9)
         pick = torch.multinomial(share.cpu(), count, replacement=True, generator=rng).to(share.device)
-        # Divided by how likely each was drawn: the mean is that over all states.
-        weight = found.flatten(0, -2)[pick] * (share.mean() / share[pick])[:, None]
+        # Divided by how likely each was drawn: the mean is that over all states before the scenes' ends.
+        going = self.leaves.get(keys.STEP) < self.env.scenes.last_step[self.leaves.get(keys.SCENE)]
+        weight = found.flatten(0, -2)[pick] * (share.sum() / going.sum() / share[pick])[:, None]
         return self.learned(self.leaves.flatten()[pick], observation).set(keys.WEIGHT, PRICE * weight)
 
     def both_kinds(self, rng: torch.Generator) -> TensorDict:
