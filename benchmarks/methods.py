@@ -2,8 +2,8 @@
 
     python benchmarks/methods.py RUN ... --towns NAME ... --roads NAME ...
 
-Each run has an evaluation on both test parts; NAME is how its file begins. Those of several trees, with a rollout
-of each, have rows of their own. The relations are those of the towns (see ``relations.py``).
+Each run has an evaluation on both test parts; NAME is its file (* and ? fit any). Those of several trees, with a
+rollout of each, have rows of their own. The relations are those of the towns (see ``relations.py``).
 """
 
 from __future__ import annotations
