@@ -154,6 +154,7 @@ def test_chosen_segments_pictures_and_animations(tmp_path: Path, capsys: pytest.
     wrong = {("--out", str(tmp_path / "a.doc")): ".mp4", ("--segments", "nothing"): "no rollouts of this segment"}
     save_rollouts(tmp_path / "other", ABOUT, pages()[2:3])
     wrong |= {("--rollouts", "1"): "a page plays all", (str(tmp_path / "other"), "--out", "b.png"): "in every folder"}
+    wrong[str(tmp_path / "other"), "--segments", "straight-0", "--out", "b.png"] = "no rollouts of this segment"
     for words, why in wrong.items():
         assert main(["view", sim, *words]) == 1
         assert why in capsys.readouterr().err

@@ -113,7 +113,7 @@ class View(shared.Command):
                 from symphony.evaluation.report import report
 
                 write_view(folders, [report(folder, picked=True) for folder in folders], out)
-            elif not (names := [name for name in names if all(name in folder.ids for folder in folders)]):
+            elif not (names := [n for n in names if self.segments or all(n in folder.ids for folder in folders)]):
                 raise errors.ConfigError("no run segment has rollouts to draw in every folder")
             else:
                 count = self.rollouts or (None if out.suffix[1:].lower() in FORMATS else 1)

@@ -430,7 +430,7 @@ def _limit(speed: ET.Element | None) -> dict[str, str]:
 def drive_as_drawn(file: Path, *, own: bool) -> None:
     """Let SUMO take lanes as long as drawn, or all seem to brake; ``own`` ones only if for cars, slow in bends."""
     tree = ET.parse(file)  # noqa: S314 - written by netconvert
-    for edge in tree.iterfind("edge"):
+    for edge in (each for each in tree.iterfind("edge") if each.get("function") != "walkingarea"):  # drawn as areas
         lines = {lane: LineString(shape(lane.attrib["shape"])) for lane in edge.iterfind("lane")}
         cars = [lane for lane in lines if for_cars(lane)]
         # Those of cars are as long as each other, or a change of lane would be a jump.
