@@ -321,7 +321,7 @@ class SceneDataset:
         each = self.experts.many(items)
         found = [(i, k, t) for i, fit in enumerate(each) for k, t in enumerate(fit.valid.int().argmax(1).tolist())]
         # Routes begin where the log does, which a fit may reach later.
-        found = [(i, k, t) for i, k, t in found if each[i].progress[k, t] <= 2 * DISPLACED]  # where routes begin
+        found = [(i, k, t) for i, k, t in found if each[i].progress[k, t] <= 2 * DISPLACED]
         pick = None if count is None else self.pick(len(found), count, items, rng).tolist()
         chosen = found if pick is None else [found[k] for k in pick]
         item, _, when = torch.tensor(chosen).unbind(1)
