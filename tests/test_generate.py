@@ -550,18 +550,18 @@ def test_only_lanes_for_cars_count_on_either_side_of_the_road(tmp_path: Path, mo
 @needs_sumo
 @pytest.mark.parametrize("rule", ['allow="bus"', 'disallow="all"', 'changeLeft="authority"'])
 def test_lanes_are_beside_each_other_where_cars_may_change(tmp_path: Path, rule: str) -> None:
-    """24 streets of three lanes: the middle one has a rule of its own."""
     run_program("netgenerate", "--grid --grid.number 3 --default.lanenumber 3 --output-file g.net.xml", tmp_path)
-    middle, file = r'<lane id="\w+_1"', tmp_path / "g.net.xml"
-    file.write_text(re.sub(middle, rf"\g<0> {rule}", file.read_text().replace(' length="', ' length="9')))
+    middle, file = r'<lane id="\w+_1"', tmp_path / "g.net.xml"  # the middle one of three has a rule of its own
+    file.write_text(re.sub(middle, rf"\g<0> {rule}", file.read_text()))
     network = read_network(net := own_network(file, tmp_path))
     lanes, left, right = (3, 1, 2) if "change" in rule else (2, 0, 0)
     assert [(~network.internal).sum(), *map(len, network.beside)] == [24 * lanes, 24 * left, 24 * right]
     assert (network.beside[0] @ [-1, 1] == 1).all()
+    net.write_text(net.read_text().replace(' length="', ' length="9'))
     drive_as_drawn(net, own=True)
     assert len(re.findall(rf'{middle} [^>]*allow="pedestrian"', net.read_text())) == 24 * (3 - lanes)  # nor buses
     for length, line in re.findall(r'<lane id="\w+" [^>]* length="(\S+)" [^>]*shape="([^"]+)"', net.read_text()):
-        assert float(length) == pytest.approx(shapely.LineString(shape(line)).length, abs=0.1)  # not the file's
+        assert float(length) == pytest.approx(shapely.LineString(shape(line)).length, abs=0.1)
 
 
 @needs_sumo
